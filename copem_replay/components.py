@@ -1,0 +1,115 @@
+"""Components: a component is its configuration, a frozen model with one method.
+
+`kind:` is a built-in name, the name of an installed entry point (group `copem_replay.<slot>`), or
+`package.module:Class`. There is no registry and nothing happens on import: a class is looked up when an experiment
+names it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Annotated, Any
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+)
+from pydantic_core import PydanticCustomError, core_schema
+
+
+class Frozen(BaseModel):
+    """Base of all models: immutable, and a key that is not known is refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Component(Frozen):
+    """Base of all components, ours and the users' own."""
+
+    kind: str
+
+
+Number = Annotated[float, Field(strict=True)]
+"""A number; text and true/false are refused."""
+Positive = Annotated[float, Field(strict=True, gt=0)]
+NotNegative = Annotated[float, Field(strict=True, ge=0)]
+Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+
+
+class Slot:
+    """Annotation of a field that holds a component: `Annotated[DetectionModel, Slot("detection", {...})]`.
+
+    `built_in` maps names to `package.module:Class`, so that nothing is imported before it is used.
+    """
+
+    def __init__(self, name: str, built_in: Mapping[str, str]) -> None:
+        self.name = name
+        self.built_in = dict(built_in)
+
+    def __get_pydantic_core_schema__(
+        self, source: type[Any], handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        """Validation: find the class that `kind` names and let it validate the rest."""
+        return core_schema.no_info_plain_validator_function(
+            self.build,
+            serialization=core_schema.plain_serializer_function_ser_schema(lambda c: c.model_dump(mode="json", by_alias=True)),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """JSON Schema: one alternative per installed component, and one for `package.module:Class`."""
+        alternatives = []
+        for kind in self.kinds():
+            described = self.find(kind).model_json_schema()
+            described["properties"]["kind"] = {"const": kind}
+            described["required"] = sorted({*described.get("required", []), "kind"})
+            alternatives.append(described)
+        own = {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]}
+        return {"anyOf": [*alternatives, own]}
+
+    def kinds(self) -> list[str]:
+        """Names that can stand in `kind:` besides `package.module:Class`."""
+        return [*self.built_in, *sorted(e.name for e in entry_points(group=f"copem_replay.{self.name}"))]
+
+    def find(self, kind: str) -> type[Component]:
+        """The class `kind` names. Raises PydanticCustomError, which reads as a problem of the experiment file."""
+        if kind in self.built_in:
+            target = self.built_in[kind]
+        elif found := [e for e in entry_points(group=f"copem_replay.{self.name}") if e.name == kind]:
+            target = found[0].value
+        elif ":" in kind:
+            target = kind
+        else:
+            known = ", ".join(self.kinds())
+            raise _problem(f"kind: expected one of {known}, or package.module:Class; found {kind!r}")
+        module, _, name = target.partition(":")
+        try:
+            component = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise _problem(f"kind: {kind!r} cannot be imported: {error}") from error
+        if not (isinstance(component, type) and issubclass(component, Component)):
+            raise _problem(f"kind: {kind!r} is not a copem_replay.Component")
+        return component
+
+    def build(self, value: object) -> Component:
+        """A component from what the experiment says of it."""
+        if isinstance(value, Component):
+            return value
+        if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
+            raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {value!r}")
+        return self.find(value["kind"]).model_validate(dict(value))
+
+
+def _problem(message: str) -> PydanticCustomError:
+    # The message is a constant to pydantic: braces of the text must not be read as fields.
+    return PydanticCustomError("component", "{message}", {"message": message})  # type: ignore[arg-type]
+
+
+__all__ = ["Component", "Count", "Frozen", "NotNegative", "Number", "Positive", "Share", "Slot"]

@@ -1,0 +1,249 @@
+"""The MCAP container: its channels, the payloads of some of them, what can be saved of a damaged file.
+
+A file with a sound index is read through it. Everything else (no index, an index that lies, a file that was
+cut off, a checksum that fails) is read from start to end, as far as it goes.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import zstandard
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import SeekingReader
+from mcap.records import Channel as ChannelRecord
+from mcap.records import DataEnd, McapRecord, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.summary import Summary
+
+from copem_replay.errors import RecordingError
+
+MAGIC = b"\x89MCAP0\r\n"
+_LFS_POINTER = b"version https://git-lfs"
+_RECORD_LIMIT_BYTES = 1 << 30  # a longer record is taken for damage (chosen)
+_FOOTER_BYTES = 20  # summary_start, summary_offset_start, summary_crc
+DAMAGE = (
+    McapError,
+    struct.error,
+    EOFError,
+    ValueError,  # includes checksums that fail and texts that are not UTF-8
+    KeyError,
+    RuntimeError,  # lz4
+    zstandard.ZstdError,
+    MemoryError,  # a length that was hit
+)
+"""What reading a damaged file raises."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel. Two may share a topic: everything is keyed by `number`."""
+
+    number: int
+    topic: str
+    schema: str  # name of the schema, "" without one
+    encoding: str  # of the messages
+    messages: int  # that can be read
+    expected: int | None = None  # of a damaged file: how many its index promises, where that is known
+
+
+class BrokenIndexError(Exception):
+    """An index that seemed sound is not, or what it points at is damaged: `from_start` is the way."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """An MCAP file that was looked at.
+
+    `damage` says what is wrong with the file, None where nothing is; `complete` whether all messages can be
+    read all the same.
+    """
+
+    path: Path
+    channels: tuple[Channel, ...]  # by number
+    indexed: bool
+    damage: str | None = None
+    complete: bool = True
+
+    def payloads(self, numbers: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
+        """Messages of some channels: channel number, log time in ns, payload.
+
+        By log time through the index, else as in the file, up to the damage. Raises BrokenIndexError.
+        """
+        topics = {c.topic for c in self.channels if c.number in numbers}
+        with open_file(self.path) as file:
+            for message in _by_index(file, topics) if self.indexed else _Stream(file):
+                if isinstance(message, Message) and message.channel_id in numbers:
+                    yield message.channel_id, message.log_time, message.data
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """Open a file to be read. Raises RecordingError."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be opened: {error.strerror}") from None
+
+
+def open_log(path: Path) -> Log:
+    """Look at an MCAP file. Raises RecordingError where it is none, or nothing in it can be read."""
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file")
+    if not path.is_file():
+        raise RecordingError(
+            f"{path}: expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}"
+        )
+    with open_file(path) as file:
+        _check_magic(path, file)
+        try:
+            reader = SeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES)
+            summary = reader.get_summary()
+            if summary is not None and _index_is_sound(summary):
+                _check_summary(file)
+                return Log(path, _channels_of(summary), indexed=True)
+        except DAMAGE as error:
+            return from_start(path, error)
+    return from_start(path)
+
+
+def from_start(
+    path: Path, index_error: BaseException | None = None, promised: tuple[Channel, ...] = ()
+) -> Log:
+    """Look at an MCAP file whose index is missing or wrong: from start to end, as far as it goes.
+
+    `promised`: the channels as the index has them, where it could be read. Raises RecordingError where there
+    is damage and no message before it.
+    """
+    counts: Counter[int] = Counter()
+    with open_file(path) as file:
+        stream = _Stream(file)
+        for record in stream:
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
+    expected = {c.number: c.messages for c in promised}
+    channels = tuple(
+        Channel(
+            number=number,
+            topic=channel.topic,
+            schema=stream.schemas.get(channel.schema_id, ""),
+            encoding=channel.message_encoding,
+            messages=counts[number],
+            expected=expected.get(number),
+        )
+        for number, channel in sorted(stream.channels.items())
+    )
+    error = stream.error or index_error
+    damage = _reason(error) if error else None
+    if damage and not sum(counts.values()):
+        raise RecordingError(f"{path}: damaged, and no message can be read ({damage})")
+    complete = error is None or stream.data_ended
+    if damage and complete:
+        damage = f"its index cannot be used ({damage}): read from start to end, no message is lost"
+    return Log(path, channels, indexed=False, damage=damage, complete=complete)
+
+
+def _reason(error: BaseException) -> str:
+    """Say why reading failed."""
+    if isinstance(error, EndOfFile | struct.error):
+        return "the file ends too early"
+    if isinstance(error, CRCValidationError):
+        return f"the checksum of a {type(error.record).__name__} record fails"
+    if isinstance(error, zstandard.ZstdError | RuntimeError):
+        return f"a chunk cannot be decompressed: {error}"
+    return (
+        f"{error}"
+        if str(error) and not isinstance(error, KeyError)
+        else f"{type(error).__name__} {error}".strip()
+    )
+
+
+def _by_index(file: IO[bytes], topics: set[str]) -> Iterator[Message]:
+    """Messages in order of log time. Raises BrokenIndexError."""
+    reader = SeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES)
+    try:
+        for _, _, message in reader.iter_messages(topics=topics):
+            yield message
+    except DAMAGE as error:
+        raise BrokenIndexError from error
+
+
+@dataclass
+class _Stream:
+    """The records of a file from its start. Damage ends it, silently: look at `error` afterwards."""
+
+    file: IO[bytes]
+    schemas: dict[int, str] = field(default_factory=dict)  # id → name
+    channels: dict[int, ChannelRecord] = field(default_factory=dict)
+    data_ended: bool = False
+    error: Exception | None = None
+
+    def __iter__(self) -> Iterator[McapRecord]:
+        self.file.seek(0)
+        try:
+            reader = StreamReader(self.file, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES)
+            for record in reader.records:
+                if isinstance(record, Schema):
+                    self.schemas.setdefault(record.id, record.name)
+                elif isinstance(record, ChannelRecord):
+                    self.channels.setdefault(record.id, record)
+                elif isinstance(record, DataEnd):
+                    self.data_ended = True
+                yield record
+        except DAMAGE as error:
+            self.error = error
+
+
+def _check_magic(path: Path, file: IO[bytes]) -> None:
+    start = file.read(64)
+    if not start:
+        raise RecordingError(f"{path}: the file is empty")
+    if start.startswith(_LFS_POINTER):
+        raise RecordingError(
+            f"{path}: a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
+        )
+    if not start.startswith(MAGIC):
+        raise RecordingError(f"{path}: expected an MCAP file, found one that starts with {start[:16]!r}")
+    file.seek(0)
+
+
+def _index_is_sound(summary: Summary) -> bool:
+    """Whether the index tells all: counts, every channel, every schema, and where the chunks are."""
+    statistics = summary.statistics
+    return (
+        statistics is not None
+        and all(number in summary.channels for number in statistics.channel_message_counts)
+        and all(c.schema_id == 0 or c.schema_id in summary.schemas for c in summary.channels.values())
+        and (statistics.message_count == 0 or bool(summary.chunk_indexes))
+        and sum(statistics.channel_message_counts.values()) == statistics.message_count
+    )
+
+
+def _check_summary(file: IO[bytes]) -> None:
+    """Check the summary, as mcap does not (MCAP specification, Footer). Raises ValueError."""
+    end = file.seek(0, os.SEEK_END) - len(MAGIC)
+    file.seek(end - _FOOTER_BYTES)
+    start, _, crc = struct.unpack("<QQI", file.read(_FOOTER_BYTES))
+    file.seek(start)
+    if crc and zlib.crc32(file.read(end - 4 - start)) != crc:
+        raise ValueError("the checksum of the index fails")
+
+
+def _channels_of(summary: Summary) -> tuple[Channel, ...]:
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    return tuple(
+        Channel(
+            number=number,
+            topic=channel.topic,
+            schema=summary.schemas[channel.schema_id].name if channel.schema_id else "",
+            encoding=channel.message_encoding,
+            messages=counts.get(number, 0),
+        )
+        for number, channel in sorted(summary.channels.items())
+    )

@@ -1,0 +1,1 @@
+"""Message formats, one module each: what a payload says, as columns."""

@@ -1,0 +1,199 @@
+"""The Ideal Fusion Model (Piazzoni et al. 2022): matching by truth id, Σ = (Σₙ Σₙ⁻¹)⁻¹, μ = Σ · Σₙ Σₙ⁻¹ μₙ.
+
+It combines what the units said, stale or not: nothing is predicted. Assumes Gaussian errors, independent across units.
+Two ways with one law: the units' sampled errors are weighed (Σₙ Σ Σₙ⁻¹ εₙ), or ε ~ N(μ, Σ) is drawn once. What the
+paper leaves open is combined by inverse variance as well: yaw on the circle, size, speed; height above ground by mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba as nb
+import numpy as np
+
+from copem_replay.chance import Address, Dice, object_words
+from copem_replay.fusion.inbox import inbox
+from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
+
+SMALLEST_VARIANCE = 1e-9
+"""A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
+
+
+def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Tracks:
+    """One fused list per instant of the receiver, as tracks of the one unit `fused`.
+
+    `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
+    which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
+    `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
+    """
+    box = inbox(heard, max_age_s=max_age_s)
+    rows, start, object_ix, instant = _contributions(heard, box.newest, without_object_ix)
+    valid = _any(heard.valid, rows, start)
+    ee, en, nn = _information(heard)
+    out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
+    _combine_position(
+        heard.valid, *_full(heard, "x_m", "y_m"), ee, en, nn, rows, start,
+        out["x_m"], out["y_m"], out["cov_ee_m2"], out["cov_en_m2"], out["cov_nn_m2"],
+    )  # fmt: skip
+    for name, variance in (
+        ("z_m", None), ("length_m", "size_var_m2"), ("width_m", "size_var_m2"), ("height_m", "size_var_m2"),
+        ("vx_mps", "speed_var_m2ps2"), ("vy_mps", "speed_var_m2ps2"),
+    ):  # fmt: skip
+        out[name] = _combine(heard, getattr(heard, name), variance, rows, start)[0]
+    yaw = np.asarray(heard.yaw_rad)
+    sin, yaw_variance = _combine(heard, np.sin(yaw), "yaw_var_rad2", rows, start)
+    out["yaw_rad"] = np.arctan2(sin, _combine(heard, np.cos(yaw), "yaw_var_rad2", rows, start)[0])
+    captured = np.where(box.newest >= 0, heard.captured_s[box.newest], -np.inf).max(axis=1, initial=-np.inf)
+    stamps = np.where(box.newest >= 0, heard.stamp_ns[box.newest], np.iinfo(np.int64).min).max(axis=1)
+    first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
+    return Tracks(
+        units=("fused",),
+        start=np.append(first, len(object_ix)),
+        unit_ix=np.zeros(len(first), dtype=np.int64),
+        object_ix=object_ix[first],
+        frame_ix=instant,
+        stamp_ns=stamps,
+        captured_s=captured,
+        frame_unit_ix=np.zeros(len(box.issue_s), dtype=np.int64),
+        arrives_s=box.issue_s[None],
+        valid=valid,
+        yaw_var_rad2=yaw_variance,
+        size_var_m2=_combine(heard, heard.z_m, "size_var_m2", rows, start)[1],
+        speed_var_m2ps2=_combine(heard, heard.z_m, "speed_var_m2ps2", rows, start)[1],
+        **out,
+    )
+
+
+def draw_posterior(expected: Tracks, scene: Scene, seed: int, runs: Int) -> Tracks:
+    """One draw of ε ~ N(μ, Σ) per object and list, around the fused expected states (S, P)."""
+    words = object_words(scene.object_ids)[expected.row_object_ix]
+    zero = np.zeros(len(words), dtype=np.int64)
+    address = Address(("",), zero, words, expected.stamp_ns[expected.frame_ix])
+    dice = Dice(seed, scene.log)
+    z1 = dice.normal("ideal fusion 1", address, runs, expected.valid)
+    z2 = dice.normal("ideal fusion 2", address, runs, expected.valid)
+    assert expected.cov_ee_m2 is not None and expected.cov_en_m2 is not None and expected.cov_nn_m2 is not None
+    l11 = np.sqrt(expected.cov_ee_m2)
+    l21 = expected.cov_en_m2 / l11
+    l22 = np.sqrt(np.maximum(expected.cov_nn_m2 - l21**2, 0.0))
+    return replace(expected, x_m=expected.x_m + l11 * z1, y_m=expected.y_m + l21 * z1 + l22 * z2)
+
+
+def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[Int, Int, Int, Int]:
+    """Which rows of `heard` make each fused row, grouped: rows (C,), start (P + 1,), object and instant (P,)."""
+    order, bounds = heard.by_frame
+    instant, _unit = np.nonzero(newest >= 0)
+    frame = newest[newest >= 0]
+    count = bounds[frame + 1] - bounds[frame]
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    rows = order[np.repeat(bounds[frame], count) + within]
+    instant = np.repeat(instant, count)
+    object_ix = heard.row_object_ix[rows]
+    keep = object_ix != without_object_ix
+    rows, instant, object_ix = rows[keep], instant[keep], object_ix[keep]
+    by = np.lexsort((heard.row_unit_ix[rows], instant, object_ix))
+    rows, instant, object_ix = rows[by], instant[by], object_ix[by]
+    new = np.flatnonzero((np.diff(object_ix, prepend=-1) != 0) | (np.diff(instant, prepend=-1) != 0))
+    return rows, np.append(new, len(rows)), object_ix[new], instant[new]
+
+
+def _information(heard: Tracks) -> tuple[Float, Float, Float]:
+    """Inverse position covariances (1 | S, P), eigenvalues floored at SMALLEST_VARIANCE."""
+    none = np.zeros((1, len(heard.frame_ix)))
+    a, b, d = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
+    half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
+    high, low = half + turn, half - turn
+    # Along the eigenvectors: cos 2φ and sin 2φ of the larger one.
+    c2 = np.where(turn > 0, (a - d) / 2 / np.where(turn > 0, turn, 1), 1.0)
+    s2 = np.where(turn > 0, b / np.where(turn > 0, turn, 1), 0.0)
+    ih, il = 1 / np.maximum(high, SMALLEST_VARIANCE), 1 / np.maximum(low, SMALLEST_VARIANCE)
+    mean, difference = (ih + il) / 2, (ih - il) / 2
+    return mean + difference * c2, difference * s2, mean - difference * c2
+
+
+def _full(heard: Tracks, *names: str) -> list[Float]:
+    """Values with a row per run, as the kernels want them."""
+    return [np.broadcast_to(getattr(heard, name), heard.valid.shape) for name in names]
+
+
+def _combine(heard: Tracks, values: Float, variance: str | None, rows: Int, start: Int) -> tuple[Float, Float]:
+    """Inverse-variance mean (S, P) of one scalar over the contributions, and its variance."""
+    given = getattr(heard, variance) if variance else None
+    shape = (1, len(heard.frame_ix))
+    weight = np.ones(shape) if variance is None else 1 / np.maximum(
+        np.zeros(shape) if given is None else given, SMALLEST_VARIANCE
+    )
+    mean = np.full((len(heard.valid), len(start) - 1), np.nan)
+    spread = np.full_like(mean, np.nan)
+    _combine_scalar(
+        heard.valid, np.broadcast_to(values, heard.valid.shape), np.broadcast_to(weight, heard.valid.shape),
+        rows, start, mean, spread,
+    )  # fmt: skip
+    if given is None:
+        spread = np.where(np.isnan(spread), np.nan, 0.0)
+    return mean, spread
+
+
+def _any(valid: Bool, rows: Int, start: Int) -> Bool:
+    out = np.zeros((len(valid), len(start) - 1), dtype=np.bool_)
+    _any_of(valid, rows, start, out)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _any_of(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
+    for s in range(out.shape[0]):
+        for p in range(out.shape[1]):
+            for c in range(start[p], start[p + 1]):
+                if valid[s, rows[c]]:
+                    out[s, p] = True
+                    break
+
+
+@nb.njit(cache=True, nogil=True)
+def _combine_position(
+    valid: Bool, x: Float, y: Float, ee: Float, en: Float, nn: Float, rows: Int, start: Int,
+    out_x: Float, out_y: Float, out_ee: Float, out_en: Float, out_nn: Float,
+) -> None:  # fmt: skip
+    shared = ee.shape[0] == 1
+    for s in range(out_x.shape[0]):
+        i = 0 if shared else s
+        for p in range(out_x.shape[1]):
+            a = b = d = u = v = x0 = y0 = 0.0
+            n = 0
+            for c in range(start[p], start[p + 1]):
+                r = rows[c]
+                if not valid[s, r]:
+                    continue
+                if n == 0:  # relative to the first: weights of exact states are large
+                    x0, y0 = x[s, r], y[s, r]
+                n += 1
+                dx, dy = x[s, r] - x0, y[s, r] - y0
+                a, b, d = a + ee[i, r], b + en[i, r], d + nn[i, r]
+                u, v = u + ee[i, r] * dx + en[i, r] * dy, v + en[i, r] * dx + nn[i, r] * dy
+            if n:
+                det = a * d - b * b
+                out_ee[s, p], out_en[s, p], out_nn[s, p] = d / det, -b / det, a / det
+                out_x[s, p], out_y[s, p] = x0 + (d * u - b * v) / det, y0 + (a * v - b * u) / det
+
+
+@nb.njit(cache=True, nogil=True)
+def _combine_scalar(
+    valid: Bool, values: Float, weight: Float, rows: Int, start: Int, mean: Float, spread: Float
+) -> None:
+    for s in range(mean.shape[0]):
+        for p in range(mean.shape[1]):
+            total = first = moment = 0.0
+            n = 0
+            for c in range(start[p], start[p + 1]):
+                r = rows[c]
+                if not valid[s, r]:
+                    continue
+                if n == 0:
+                    first = values[s, r]
+                n += 1
+                total += weight[s, r]
+                moment += weight[s, r] * (values[s, r] - first)
+            if n:
+                mean[s, p], spread[s, p] = first + moment / total, 1 / total

@@ -1,0 +1,1 @@
+"""Perception error models: conditions, detection models, error models."""

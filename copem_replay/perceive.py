@@ -1,0 +1,101 @@
+"""Perceive: what each unit lists of the world, and with which errors (W̃_n = PEM_n(W), the paper's eq. for one unit).
+
+Detection is decided first, then the error is sampled, as in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from copem_replay.candidates import Candidates
+from copem_replay.chance import Address, Dice, object_words
+from copem_replay.experiment import Experiment
+from copem_replay.resample import wrap
+from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
+
+SMALLEST_SIZE_M = 0.05
+"""A size error never makes a box smaller than this (chosen)."""
+
+
+def perceive(
+    scene: Scene,
+    found: Candidates,
+    experiment: Experiment,
+    runs: Int,
+    *,
+    states: Literal["true", "expected", "sampled"] = "sampled",
+) -> Tracks:
+    """Tracks of every unit in the runs (S,): `valid (S, P)` says what was listed.
+
+    States are the true ones (which is all that detection times by truth id need), the expected ones (true state plus
+    the mean error) or sampled. What was listed does not depend on `states`.
+    """
+    tracks = found.tracks
+    dice = Dice(experiment.seed, scene.log)
+    address = Address(
+        tracks.units,
+        tracks.row_unit_ix,
+        object_words(scene.object_ids)[tracks.row_object_ix],
+        tracks.stamp_ns[tracks.frame_ix],
+    )
+    valid = dice.bernoulli("detection", address, runs, found.probability)
+    seen = replace(tracks, valid=valid)
+    if states == "true":
+        return seen
+    return _with_errors(seen, found, experiment, _Draws(dice, address, runs, valid, states == "expected"))
+
+
+class _Draws:
+    """Hands standard normals to the error models, by row; zeros where the expected state is asked for."""
+
+    def __init__(self, dice: Dice, address: Address, runs: Int, valid: Bool, zero: bool) -> None:
+        self._dice, self._address, self._runs, self._valid, self._zero = dice, address, runs, valid, zero
+
+    def normal(self, name: str, rows: Int) -> Float:
+        if self._zero:
+            return np.zeros((len(self._runs), len(rows)))
+        return self._dice.normal(
+            f"error {name}", self._address.take(rows), self._runs, np.ascontiguousarray(self._valid[:, rows])
+        )
+
+
+def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws: _Draws) -> Tracks:
+    S, P = seen.valid.shape
+    columns = {
+        name: np.repeat(getattr(seen, name), S, axis=0)
+        for name in ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
+    }
+    spread = {
+        name: np.zeros((1, P))
+        for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
+    }
+    for k, unit in enumerate(experiment.units.values()):
+        for c, couple in enumerate(experiment.pems[unit.pem]):
+            rows = np.flatnonzero((seen.row_unit_ix == k) & (found.couple_ix == c))
+            if couple.error is None or not len(rows):
+                continue
+            errors = couple.error.perturb(found.look.take(rows), lambda name, rows=rows: draws.normal(name, rows))
+            columns["x_m"][:, rows] += errors.east_m
+            columns["y_m"][:, rows] += errors.north_m
+            for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
+                spread[name][0, rows] = getattr(errors, name)
+            if errors.yaw_rad is not None:
+                columns["yaw_rad"][:, rows] = wrap(columns["yaw_rad"][:, rows] + errors.yaw_rad)
+                spread["yaw_var_rad2"][0, rows] = errors.yaw_var_rad2
+            if errors.size_m is not None:
+                for axis, name in enumerate(("length_m", "width_m", "height_m")):
+                    sized = columns[name][:, rows] + errors.size_m[axis]
+                    columns[name][:, rows] = np.maximum(sized, SMALLEST_SIZE_M)
+                spread["size_var_m2"][0, rows] = errors.size_var_m2
+            if errors.speed_mps is not None:
+                speed = found.look.speed_mps[rows]
+                # Along the direction of travel; of the heading where the object stands.
+                east = np.where(speed > 0, seen.vx_mps[0, rows] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, rows]))
+                north = np.where(speed > 0, seen.vy_mps[0, rows] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, rows]))
+                columns["vx_mps"][:, rows] += errors.speed_mps * east
+                columns["vy_mps"][:, rows] += errors.speed_mps * north
+                spread["speed_var_m2ps2"][0, rows] = errors.speed_var_m2ps2
+    return replace(seen, **columns, **spread)

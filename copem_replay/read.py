@@ -1,0 +1,195 @@
+"""Reading a recording: the world as the log has it.
+
+Selects the truth by the names of schemas, decodes it, and says what it skipped, derived or corrected.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from copem_replay import container
+from copem_replay.assemble import assemble
+from copem_replay.container import Channel, Log
+from copem_replay.errors import RecordingError
+from copem_replay.formats import osi
+from copem_replay.formats.columns import Columns
+from copem_replay.tracks import CLASSES, Scene, Tracks
+from copem_replay.wording import counted
+
+_SHOWN = 12  # ids named in an error (chosen)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log as it was read.
+
+    `truth` has the one unit TRUTH, one run, and arrives as it is captured. `host_id` is the host vehicle as
+    the log names it, whether or not there is such an object; `scene.ego_ix` is −1 where there is none.
+    """
+
+    scene: Scene
+    truth: Tracks
+    path: Path
+    topic: str
+    notes: tuple[str, ...]  # a line per kind of thing derived, corrected, skipped or ignored
+    host_id: str | None
+    damage: str | None = (
+        None  # what is wrong with the file and how far it could be read; among the notes, too
+    )
+
+
+def read(path: Path | str, *, name: str, ego: str | None = None, topic: str | None = None) -> Recording:
+    """Read the truth of the recording at `path`, as the log called `name`.
+
+    `ego`: id of the ego vehicle, None for the host vehicle the log names. `topic`: where the truth is, None
+    where there is only one candidate. Raises RecordingError, one line: no such file, no MCAP file, no truth,
+    no usable object, no such ego, no such topic, or several.
+    """
+    return read_log(container.open_log(Path(path)), name=name, ego=ego, topic=topic)
+
+
+def read_log(log: Log, *, name: str, ego: str | None = None, topic: str | None = None) -> Recording:
+    """Do the same with a log that was opened before."""
+    topic, notes = choose_topic(log, topic)
+    try:
+        columns = _decode(log, topic)
+    except container.BrokenIndexError as error:
+        log = container.from_start(log.path, error.__cause__, log.channels)
+        columns = _decode(log, topic)
+    scene, truth, found = assemble(columns, name)
+    notes += [*columns.notes, *found]
+    if scene is None or truth is None:
+        read_messages = sum(c.messages for c in log.channels if c.topic == topic)
+        damage = _damage(log, topic, None)
+        why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
+        raise RecordingError(
+            f"{log.path}: {topic}: no usable object in {counted(read_messages, 'message')}{why}"
+        )
+    host, said = _host(columns.hosts)
+    ego_ix, more = _ego(log.path, scene, ego, host)
+    damage = _damage(log, topic, scene.end_s)
+    notes = [*([damage] if damage else []), *notes, *said, *more]
+    return Recording(replace(scene, ego_ix=ego_ix), truth, log.path, topic, tuple(notes), host, damage)
+
+
+def is_truth(channel: Channel) -> bool:
+    """Whether the channel holds the truth in a format of this version."""
+    return channel.schema in osi.TRUTH_SCHEMAS and channel.encoding == "protobuf"
+
+
+def truth_topics(log: Log) -> dict[str, str]:
+    """Topics with at least one message of the truth, and their schema."""
+    return {c.topic: c.schema for c in log.channels if is_truth(c) and c.messages}
+
+
+def choose_topic(log: Log, topic: str | None = None) -> tuple[str, list[str]]:
+    """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
+    if not any(c.messages for c in log.channels):
+        raise RecordingError(f"{log.path}: holds no message ({_listed(log.channels) or 'and no channel'})")
+    topics = truth_topics(log)
+    if not topics:
+        raise RecordingError(
+            f"{log.path}: no list of true objects; read are {' and '.join(osi.TRUTH_SCHEMAS)} (protobuf), "
+            f"the file holds {_listed(log.channels)}"
+        )
+    if topic is not None and topic not in topics:
+        raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; they are on {_named(topics)}")
+    chosen = topic if topic is not None else _only(topics)
+    if chosen is None:
+        raise RecordingError(
+            f"{log.path}: true objects on several topics, {_named(topics)}: "
+            "choose one with `read: {topic: …}` in the experiment"
+        )
+    return chosen, _ignored(log, chosen, topics)
+
+
+def _only(topics: dict[str, str]) -> str | None:
+    """Find the topic to take unasked: the only one, or the only GroundTruth beside SensorViews."""
+    truths = [t for t, schema in topics.items() if schema == osi.GROUND_TRUTH]
+    candidates = truths or list(topics)
+    return candidates[0] if len(candidates) == 1 else None
+
+
+def _ignored(log: Log, chosen: str, topics: dict[str, str]) -> list[str]:
+    """Say what is not read."""
+    notes = [f"topic {t} ({schema}) not read: {chosen} taken" for t, schema in topics.items() if t != chosen]
+    skipped = Counter[str]()
+    for channel in log.channels:
+        if channel.messages and not is_truth(channel):
+            skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
+    return notes + [
+        f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()
+    ]
+
+
+def _decode(log: Log, topic: str) -> Columns:
+    """All messages of the truth on a topic. Raises BrokenIndexError."""
+    schema_of = {c.number: c.schema for c in log.channels if c.topic == topic and is_truth(c)}
+    decoder = osi.Decoder()
+    for number, log_time_ns, payload in log.payloads(frozenset(schema_of)):
+        decoder.add(payload, schema=schema_of[number], log_time_ns=log_time_ns)
+    return decoder.columns()
+
+
+def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
+    """Say what is wrong with the file, and how far it could be read."""
+    if log.damage is None:
+        return None
+    if log.complete:
+        return f"damaged: {log.damage}"
+    channels = [c for c in log.channels if c.topic == topic and is_truth(c)]
+    number = sum(c.messages for c in channels)
+    expected = sum(c.expected for c in channels if c.expected is not None)
+    of = f" of {expected}" if expected else ""
+    after = "damaged" if end_s is None else f"damaged after {end_s:.3f} s"
+    return f"{after}: {number}{of} messages read ({log.damage})"
+
+
+def _host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Find the host vehicle's id, None where no message says one, and notes."""
+    if not hosts:
+        return None, []
+    said = Counter(hosts).most_common()  # of equally frequent ones the first
+    if len(said) == 1:
+        return said[0][0], []
+    ids = ", ".join(f"{ident} in {counted(number, 'message')}" for ident, number in said[:_SHOWN])
+    return said[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
+
+
+def _ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[int, list[str]]:
+    """Index of the ego vehicle, −1 without one, and notes. Raises RecordingError: no such moving object."""
+    wanted = host if ego is None else ego
+    index = -1 if wanted is None else scene.object_number.get(wanted, -1)
+    if index >= 0 and scene.moving[index]:
+        return index, []
+    if ego is not None:
+        raise RecordingError(f"{path}: ego: no moving object {ego!r}; there are {moving_ids(scene)}")
+    if host is not None:
+        return -1, [f"the host vehicle {host} is not among the moving objects: no ego vehicle"]
+    return -1, []
+
+
+def moving_ids(scene: Scene, shown: int = _SHOWN) -> str:
+    """`3 (car), 7 (pedestrian), … (12 in all)`: moving objects, vehicles first, then by appearance."""
+    movers = np.flatnonzero(scene.moving)
+    names = [(scene.object_ids[k], CLASSES[scene.object_class[k]]) for k in movers]
+    names.sort(key=lambda n: n[1] in ("pedestrian", "bicycle", "animal", "other"))
+    text = ", ".join(f"{ident} ({what})" for ident, what in names[:shown])
+    return f"{text}, … ({len(names)} in all)" if len(names) > shown else text or "none"
+
+
+def _named(topics: dict[str, str]) -> str:
+    return ", ".join(f"{topic} ({schema})" for topic, schema in topics.items())
+
+
+def _listed(channels: Sequence[Channel]) -> str:
+    """Schemas and topics of a file, for an error."""
+    return ", ".join(
+        f"{c.schema or 'no schema'}{'' if c.encoding == 'protobuf' else f' ({c.encoding})'} on {c.topic}"
+        for c in channels
+    )

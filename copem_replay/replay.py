@@ -1,0 +1,106 @@
+"""Replay: one log through one experiment. What does not depend on the run is prepared once; a block of runs is a pure
+function of it, so that blocks can be computed anywhere, in any order, by any number of workers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.candidates import Candidates, candidates
+from copem_replay.detect import Detections, detect
+from copem_replay.experiment import Configuration, Experiment
+from copem_replay.fusion.ideal import draw_posterior, fuse
+from copem_replay.fusion.inbox import inbox
+from copem_replay.measure import table
+from copem_replay.onset import Looks, looks
+from copem_replay.perceive import perceive
+from copem_replay.read import Recording
+from copem_replay.resample import at_instants
+from copem_replay.tracks import TRUTH, Int, Scene, Tracks
+from copem_replay.transmit import transmit
+
+ROWS_TIMES_RUNS = 50_000_000
+"""How many row × run cells a block may hold (chosen: a byte each while only detections are drawn)."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One log made ready: nothing in it depends on the run or on a configuration."""
+
+    scene: Scene
+    truth: Tracks  # the world at its own frames, short gaps filled
+    found: Candidates
+    measured: Candidates  # the rows of objects that are looked at
+    looks: Looks
+
+
+def prepare(recording: Recording, experiment: Experiment) -> Replay:
+    """Everything about a log that all runs and configurations share."""
+    scene = recording.scene
+    truth = at_instants(
+        recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
+    )
+    found = candidates(scene, truth, experiment)
+    on = looks(scene, truth, found.static, experiment)
+    return Replay(scene, truth, found, found.of_objects(on.object_ix), on)
+
+
+def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
+    """The runs cut into blocks, small enough for memory and enough of them for the workers."""
+    rows = max(len(replay.measured.tracks.frame_ix), 1)
+    size = max(1, min(ROWS_TIMES_RUNS // rows, -(-experiment.runs // jobs)))
+    return [np.arange(k, min(k + size, experiment.runs)) for k in range(0, experiment.runs, size)]
+
+
+def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
+    """The rows of `detections.parquet` of one block of runs (S,)."""
+    seen = perceive(replay.scene, replay.measured, experiment, runs, states="true")
+    results: dict[str, tuple[tuple[str, ...], Detections]] = {}
+    for name, configuration in experiment.configurations.items():
+        heard = listen(seen, replay.truth, experiment, configuration)
+        result = detect(
+            heard,
+            replay.looks,
+            confirm=experiment.measure.confirm,
+            count_earlier=experiment.measure.count_earlier,
+            max_age_s=configuration.max_age_s,
+        )
+        results[name] = (heard.units, result)
+    return table(replay.scene, replay.truth, experiment, replay.looks, runs, results)
+
+
+def listen(seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration) -> Tracks:
+    """What reaches the receiver in one configuration: the lists of its units, late."""
+    if configuration.units == "truth":
+        return transmit(truth, configuration.latency_of)
+    return transmit(seen.take_units(experiment.units_of(configuration)), configuration.latency_of)
+
+
+def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Tracks]:
+    """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
+    runs = np.array([run])
+    ego = replay.scene.ego_ix
+    sampled = perceive(replay.scene, replay.found, experiment, runs)
+    result = {}
+    for name, configuration in experiment.configurations.items():
+        posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
+        seen = (
+            perceive(replay.scene, replay.found, experiment, runs, states="expected") if posterior else sampled
+        )
+        heard = listen(seen, replay.truth, experiment, configuration)
+        fused = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
+        result[name] = draw_posterior(fused, replay.scene, experiment.seed, runs) if posterior else fused
+    return result
+
+
+def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
+    """For each configuration how many intervals between fused lists there are, and the seconds they cover."""
+    rates = {}
+    for name, configuration in experiment.configurations.items():
+        heard = listen(replay.measured.tracks, replay.truth, experiment, configuration)
+        issue_s = inbox(heard, max_age_s=configuration.max_age_s).issue_s
+        rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
+    return rates

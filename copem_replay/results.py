@@ -1,0 +1,160 @@
+"""The results folder: complete under its name, or not there at all.
+
+Everything is written into a folder beside it first, which then takes its name. Same input, same seed: the same bytes in
+all but the .rrd.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+
+import pandas as pd
+
+from copem_replay.errors import OutputError
+from copem_replay.experiment import Experiment
+from copem_replay.experiment_file import dump
+from copem_replay.read import Recording
+from copem_replay.replay import believed
+from copem_replay.run import Result, log_path_of, shown_logs, shown_run
+
+_LIBRARIES = (
+    "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
+    "shapely",
+)  # fmt: skip
+_MARK = "provenance.json"
+
+
+def check_target(folder: Path, *, overwrite: bool) -> None:
+    """Whether a results folder may be written here. Raises OutputError."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise OutputError(f"{folder}: expected a folder for the results, found a file")
+    if not any(folder.iterdir()):
+        return
+    if not (folder / _MARK).exists():
+        raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
+    if not overwrite:
+        raise OutputError(f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder")
+
+
+def write_results(
+    folder: Path,
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    result: Result,
+    *,
+    skipped: Sequence[tuple[Path, str]] = (),
+    overwrite: bool = False,
+) -> None:
+    """Write the folder of the contract. Raises OutputError."""
+    check_target(folder, overwrite=overwrite)
+    folder = Path(os.path.abspath(folder))
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".tmp"))
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
+    try:
+        scratch.chmod(0o777 & ~_umask())
+        _fill(scratch, folder, experiment, recordings, result, skipped)
+        _replace(scratch, folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _fill(
+    scratch: Path, folder: Path, experiment: Experiment, recordings: Sequence[Recording], result: Result,
+    skipped: Sequence[tuple[Path, str]],
+) -> None:  # fmt: skip
+    data = experiment.as_written()
+    data["logs"] = [os.path.relpath(recording.path.resolve(), folder.resolve()) for recording in recordings]
+    (scratch / "experiment.yaml").write_text(dump(data), encoding="utf-8")
+    provenance = provenance_of(experiment, recordings, result, skipped)
+    (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    result.table.to_parquet(scratch / "detections.parquet", engine="pyarrow", index=False)
+    write_csv(result.summary, scratch / "summary.csv")
+    logs = shown_logs(experiment, result)
+    for log in logs:
+        target = scratch / "replay" if len(recordings) == 1 else scratch / "replay" / log
+        _show(target, log, experiment, recordings, result)
+
+
+def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> None:
+    from copem_replay.show import write_rrd
+    from copem_replay.write import write_mcap
+
+    number = shown_run(experiment, result, log)
+    assert number is not None  # shown_logs names none otherwise
+    replay = next(r for r in result.replays if r.scene.log == log)
+    beliefs = believed(replay, experiment, number)
+    rows = result.table[(result.table["log"] == log) & (result.table["run"] == number)]
+    write_mcap(Path(f"{target}.mcap"), log_path_of(recordings, log), replay.scene, beliefs)
+    write_rrd(Path(f"{target}.rrd"), replay, experiment, beliefs, rows, result.summary, number)
+
+
+def provenance_of(
+    experiment: Experiment, recordings: Sequence[Recording], result: Result, skipped: Sequence[tuple[Path, str]]
+) -> dict[str, object]:
+    """What made these results: versions, logs, seed, metric parameters; no clock, no host."""
+    return {
+        "copem_replay": version("copem-replay"),
+        "python": platform.python_version(),
+        "libraries": {name: version(name) for name in _LIBRARIES},
+        "seed": experiment.seed,
+        "runs": experiment.runs,
+        "logs": [
+            {"log": r.scene.log, "topic": r.topic, "sha256": _sha256(r.path)} for r in recordings
+        ],
+        "logs_skipped": [{"log": path.name, "reason": reason} for path, reason in skipped],
+        "visibility": experiment.visibility,
+        "max_gap_s": experiment.max_gap_s,
+        "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
+        "run_shown": {log: shown_run(experiment, result, log) for log in shown_logs(experiment, result)},
+        "notes": list(result.notes),
+    }  # fmt: skip
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> None:
+    """A table as CSV: nulls empty, numbers with nine significant digits."""
+    table.to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _replace(scratch: Path, folder: Path) -> None:
+    """Give `scratch` the name `folder`. What was there goes only when the new one is complete."""
+    if not folder.exists():
+        os.replace(scratch, folder)
+        return
+    old = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".old"))
+    try:
+        os.replace(folder, old / folder.name)
+        try:
+            os.replace(scratch, folder)
+        except BaseException:
+            with suppress(OSError):
+                os.replace(old / folder.name, folder)
+            raise
+    finally:
+        shutil.rmtree(old, ignore_errors=True)

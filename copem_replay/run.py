@@ -1,0 +1,114 @@
+"""Run: experiment × logs × blocks of runs → results folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from copem_replay import replay as replays
+from copem_replay.experiment import Experiment
+from copem_replay.read import Recording
+from copem_replay.replay import Replay
+from copem_replay.summary import horizon_s, summary
+
+Progress = Callable[[int, int], None]
+"""`progress(done, total)`, called after each block of runs."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one experiment gave."""
+
+    table: pd.DataFrame  # detections.parquet
+    summary: pd.DataFrame  # summary.csv
+    notes: tuple[str, ...]  # what has to be said, one line each
+    replays: tuple[Replay, ...]  # one per log
+    horizon_s: float | None
+
+
+def run(
+    experiment: Experiment, recordings: Sequence[Recording], *, jobs: int = 1, progress: Progress | None = None
+) -> Result:
+    """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks."""
+    ready = [replays.prepare(recording, experiment) for recording in recordings]
+    work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, jobs)]
+    parts: list[pd.DataFrame] = []
+    with ThreadPoolExecutor(jobs) as pool:
+        done = pool.map(lambda item: replays.replay_block(item[0], experiment, item[1]), work)
+        for part in done:
+            parts.append(part)
+            if progress is not None:
+                progress(len(parts), len(work))
+    table = _in_order(pd.concat(parts, ignore_index=True), [r.scene.log for r in ready], experiment)
+    rates = [replays.list_rates(replay, experiment) for replay in ready]
+    horizon = horizon_s(table, experiment.measure.horizon_s)
+    rows, said = summary(
+        table,
+        list(experiment.configurations),
+        {name: _rate([r[name] for r in rates]) for name in experiment.configurations},
+        seed=experiment.seed,
+        horizon_s=horizon,
+    )
+    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
+    notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay)]
+    return Result(table, rows, (*notes, *said), tuple(ready), horizon)
+
+
+def _in_order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> pd.DataFrame:
+    """By log, configuration, run and object, however the runs were cut into blocks."""
+    log = table["log"].map({name: k for k, name in enumerate(logs)}).to_numpy()
+    configuration = table["configuration"].map({n: k for k, n in enumerate(experiment.configurations)}).to_numpy()
+    order = np.lexsort((table["run"].to_numpy(), configuration, log))
+    return table.iloc[order].reset_index(drop=True)
+
+
+def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:
+    count, span_s = sum(n for n, _ in intervals), sum(s for _, s in intervals)
+    return count / span_s if span_s > 0 else None
+
+
+def _notes(replay: Replay) -> list[str]:
+    notes = list(replay.found.notes)
+    if not len(replay.looks.object_ix):
+        notes.append("no measured object has an onset: no rows")
+    return notes
+
+
+def shown_run(experiment: Experiment, result: Result, log: str) -> int | None:
+    """Which run of a log is written to MCAP and .rrd.
+
+    `median` and `worst` rank the runs by the time to detection summed over configurations and measured objects, never
+    detected counting as the horizon; of equal runs the first.
+    """
+    if experiment.show is None or experiment.show.run is None:
+        return None
+    if isinstance(experiment.show.run, int):
+        return experiment.show.run
+    part = result.table[result.table["log"] == log]
+    if not len(part):
+        return 0
+    time_s = part["time_to_detection_s"].fillna(result.horizon_s)
+    total = time_s.groupby(part["run"]).sum()
+    ranked = total.index[np.argsort(total.to_numpy(), kind="stable")]
+    return int(ranked[-1] if experiment.show.run == "worst" else ranked[(len(ranked) - 1) // 2])
+
+
+def shown_logs(experiment: Experiment, result: Result) -> list[str]:
+    """Names of the logs that are written to MCAP and .rrd."""
+    names = [replay.scene.log for replay in result.replays]
+    if experiment.show is None or experiment.show.run is None:
+        return []
+    wanted = experiment.show.logs
+    if "all" in wanted:
+        return names
+    return [name for k, name in enumerate(names) if name in wanted or (k == 0 and "first" in wanted)]
+
+
+def log_path_of(recordings: Sequence[Recording], log: str) -> Path:
+    """Where a log lies."""
+    return next(recording.path for recording in recordings if recording.scene.log == log)

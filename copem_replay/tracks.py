@@ -1,0 +1,210 @@
+"""Tracks and Scene: the type that flows. Read this first.
+
+A log is a bag of tracks. `Tracks` is ragged: its rows are the entries of a sparse matrix tracks × frames,
+stored track by track. A *track* is one object as one unit has it, a *frame* is one list of one unit, a *row*
+is one object in one list. The runs of a Monte Carlo are the leading axis of the values.
+
+Letters of the shapes, here and everywhere: E tracks, P rows, F frames (lists), S runs, N objects, U units.
+Values are `(S, P)`, or `(1, P)` where all runs agree.
+
+Frame of reference: the log's world frame, east (x), north (y), up (z), metres; yaw in radians counter-clockwise
+from east; positions are centres of boxes. Times: integer nanoseconds of the log's clock (`stamp_ns`), or float
+seconds since the log's start `Scene.t0_ns`. Three times, three words: *captured* (the instant whose state a
+list shows), *arrives* (when the receiver has it), *now*.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+CLASSES = (
+    "pedestrian",
+    "bicycle",
+    "motorcycle",
+    "car",
+    "van",
+    "truck",
+    "bus",
+    "trailer",
+    "animal",
+    "other",
+    "vehicle",
+)
+"""What an object can be; `vehicle`: a vehicle, not said which."""
+
+CLASS_GROUPS = {
+    "vru": ("pedestrian", "bicycle", "motorcycle"),
+    "vehicles": ("motorcycle", "car", "van", "truck", "bus", "trailer", "vehicle"),
+}
+"""Names that stand for several classes (`vru`: vulnerable road users)."""
+
+SAME_INSTANT_NS = 1_000
+"""Two instants closer than this are one (1 µs, from the contract)."""
+
+TRUTH = "truth"
+"""Name of the unit that is no unit: the world as recorded."""
+
+
+def class_indices(names: tuple[str, ...]) -> NDArray[np.int8]:
+    """Indices into `CLASSES` of class and group names, sorted, each once: (K,)."""
+    members = {m for name in names for m in CLASS_GROUPS.get(name, (name,))}
+    return np.array(sorted(CLASSES.index(m) for m in members), dtype=np.int8)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What does not change during one log.
+
+    `moving` is False for stationary objects (they hide others; they are measured only when named).
+    `ego_ix` is −1 where the log has no ego vehicle, or none was chosen.
+    """
+
+    log: str
+    t0_ns: int
+    end_ns: int
+    object_ids: tuple[str, ...]  # N
+    object_class: NDArray[np.int8]  # (N,) index into CLASSES
+    moving: Bool  # (N,)
+    ego_ix: int = -1
+
+    @cached_property
+    def object_number(self) -> dict[str, int]:
+        """Index of each object id."""
+        return {name: k for k, name in enumerate(self.object_ids)}
+
+    @property
+    def end_s(self) -> float:
+        """The log's last instant, seconds since its start."""
+        return (self.end_ns - self.t0_ns) * 1e-9
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Objects as units have them, over time and runs. Shapes are checked here and nowhere else.
+
+    Rows of a track are in order of capture, `start[e]:start[e + 1]`; a track has at least one row. NaN may lie
+    under `valid == False` and nowhere else. Covariances are None where states are exact.
+    Raises ValueError when a shape is wrong: that is a defect of the caller, never of a recording.
+    """
+
+    units: tuple[str, ...]  # U names; the truth has the one unit TRUTH
+    start: Int  # (E + 1,)
+    unit_ix: Int  # (E,)
+    object_ix: Int  # (E,) index into Scene.object_ids
+    frame_ix: Int  # (P,)
+    stamp_ns: Int  # (F,) capture instants
+    captured_s: Float  # (F,)
+    frame_unit_ix: Int  # (F,)
+    arrives_s: Float  # (S | 1, F); inf: never
+    valid: Bool  # (S | 1, P)
+    x_m: Float  # values, all (S | 1, P)
+    y_m: Float
+    z_m: Float
+    yaw_rad: Float
+    vx_mps: Float
+    vy_mps: Float
+    length_m: Float
+    width_m: Float
+    height_m: Float
+    cov_ee_m2: Float | None = None  # position covariance, easting and northing
+    cov_en_m2: Float | None = None
+    cov_nn_m2: Float | None = None
+    yaw_var_rad2: Float | None = None
+    size_var_m2: Float | None = None  # of length, width and height alike
+    speed_var_m2ps2: Float | None = None
+
+    def __post_init__(self) -> None:
+        E, P, F = len(self.unit_ix), len(self.frame_ix), len(self.stamp_ns)
+        expected = {"start": (E + 1,), "object_ix": (E,), "captured_s": (F,), "frame_unit_ix": (F,)}
+        for name, shape in expected.items():
+            if (found := getattr(self, name).shape) != shape:
+                raise ValueError(f"Tracks.{name}: expected shape {shape}, found {found}")
+        if E and (self.start[0] != 0 or self.start[-1] != P or (np.diff(self.start) < 1).any()):
+            raise ValueError("Tracks.start: expected 0 … P, strictly increasing (no empty tracks)")
+        runs = {1}
+        for name in ("arrives_s", "valid", *VALUES, *UNCERTAINTIES):
+            array = getattr(self, name)
+            if array is None:
+                continue
+            columns = F if name == "arrives_s" else P
+            if array.ndim != 2 or array.shape[1] != columns:
+                raise ValueError(f"Tracks.{name}: expected (runs, {columns}), found {array.shape}")
+            runs.add(array.shape[0])
+        if len(runs) > 2:
+            raise ValueError(f"Tracks: values disagree on the number of runs: {sorted(runs)}")
+
+    @cached_property
+    def track_ix(self) -> Int:
+        """(P,) the track of each row."""
+        return np.repeat(np.arange(len(self.unit_ix)), np.diff(self.start))
+
+    @cached_property
+    def row_object_ix(self) -> Int:
+        """(P,) the object of each row."""
+        return self.object_ix[self.track_ix]
+
+    @cached_property
+    def row_unit_ix(self) -> Int:
+        """(P,) the unit of each row."""
+        return self.unit_ix[self.track_ix]
+
+    @cached_property
+    def row_captured_s(self) -> Float:
+        """(P,) when each row was captured."""
+        return self.captured_s[self.frame_ix]
+
+    @cached_property
+    def by_frame(self) -> tuple[Int, Int]:
+        """The other order: rows list by list (P,), and where each list starts (F + 1,)."""
+        order = np.argsort(self.frame_ix, kind="stable")
+        bounds = np.searchsorted(self.frame_ix[order], np.arange(len(self.stamp_ns) + 1))
+        return order, bounds
+
+    def take_tracks(self, keep: Bool) -> Tracks:
+        """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
+        if keep.all():
+            return self
+        rows = keep[self.track_ix]
+        columns = {
+            name: None if (a := getattr(self, name)) is None else a[:, rows]
+            for name in ("valid", *VALUES, *UNCERTAINTIES)
+        }
+        return replace(
+            self,
+            start=np.concatenate([[0], np.cumsum(np.diff(self.start)[keep])]),
+            unit_ix=self.unit_ix[keep],
+            object_ix=self.object_ix[keep],
+            frame_ix=self.frame_ix[rows],
+            **columns,
+        )
+
+    def take_units(self, names: tuple[str, ...]) -> Tracks:
+        """Only the units of `names`, their tracks and their lists, in the order they have here."""
+        kept = np.array([name in names for name in self.units])
+        if kept.all():
+            return self
+        tracks = self.take_tracks(kept[self.unit_ix])
+        frames = kept[self.frame_unit_ix]
+        unit_number, frame_number = np.cumsum(kept) - 1, np.cumsum(frames) - 1
+        return replace(
+            tracks,
+            units=tuple(name for name in self.units if name in names),
+            unit_ix=unit_number[tracks.unit_ix],
+            frame_ix=frame_number[tracks.frame_ix],
+            stamp_ns=self.stamp_ns[frames],
+            captured_s=self.captured_s[frames],
+            frame_unit_ix=unit_number[self.frame_unit_ix[frames]],
+            arrives_s=self.arrives_s[:, frames],
+        )
+
+
+VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
+UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)

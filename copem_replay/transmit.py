@@ -1,0 +1,16 @@
+"""Transmit: when the receiver has each list. Arrival is capture plus latency exactly, no rounding to a tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from copem_replay.tracks import Tracks
+
+
+def transmit(seen: Tracks, latency_of: Callable[[str], float]) -> Tracks:
+    """The same tracks with the arrival times of their lists: `latency_of(unit's name)` in seconds."""
+    latency_s = np.array([latency_of(name) for name in seen.units] or [0.0])
+    return replace(seen, arrives_s=(seen.captured_s + latency_s[seen.frame_unit_ix])[None])

@@ -1,0 +1,110 @@
+"""Perception units: where each one is at each of its lists."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.experiment import Obstacle, Unit
+from copem_replay.resample import wrap
+from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.visibility import NO_STATICS, Statics, statics
+
+GROUND_WITHIN_M = 50.0
+"""How far the nearest object may be whose ground is taken for a fixed place (the contract's)."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """One unit at the instants of its lists. All (F,); NaN under `present == False`."""
+
+    x_m: Float
+    y_m: Float
+    z_m: Float  # of the sensor itself
+    heading_rad: Float
+    present: Bool
+
+
+def list_instants(scene: Scene, truth: Tracks, unit: Unit) -> Int:
+    """(F,) capture stamps of a unit's lists: the frames of the truth, or t0 + phase + k / rate within the log."""
+    if unit.rate_hz is None:
+        return truth.stamp_ns
+    first_ns = unit.phase_s * 1e9
+    period_ns = 1e9 / unit.rate_hz
+    span_ns = scene.end_ns - scene.t0_ns + SAME_INSTANT_NS
+    count = int(np.floor((span_ns - first_ns) / period_ns)) + 1 if span_ns >= first_ns else 0
+    stamps: Int = scene.t0_ns + np.rint(first_ns + np.arange(count) * period_ns).astype(np.int64)
+    return stamps
+
+
+def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
+    """Where a unit is at each list of `world`, which holds the world at the unit's list instants."""
+    n = len(world.stamp_ns)
+    if unit.at is not None:
+        heading = np.full(n, wrap(np.deg2rad(np.array(unit.yaw_deg))))
+        x, y, z = (np.full(n, v) for v in (*unit.at, ground_m))
+        present = np.ones(n, dtype=bool)
+    else:
+        x, y, z, yaw = (np.full(n, np.nan) for _ in range(4))
+        rows = np.flatnonzero(world.row_object_ix == carrier(scene, unit))
+        at = world.frame_ix[rows]
+        present = np.zeros(n, dtype=bool)
+        present[at] = True
+        x[at], y[at], yaw[at] = world.x_m[0, rows], world.y_m[0, rows], world.yaw_rad[0, rows]
+        z[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2
+        forward, left = unit.offset_m
+        x = x + np.cos(yaw) * forward - np.sin(yaw) * left
+        y = y + np.sin(yaw) * forward + np.cos(yaw) * left
+        heading = wrap(yaw + np.deg2rad(unit.yaw_deg))
+    return Poses(x, y, z + unit.height_m, heading, present)
+
+
+def carrier(scene: Scene, unit: Unit) -> int:
+    """Index of the object that carries a unit, −1 for a fixed place."""
+    if unit.at is not None:
+        return -1
+    return scene.ego_ix if unit.on == "ego" else scene.object_number[str(unit.on)]
+
+
+def ground_at(truth: Tracks, corners: Float) -> float | None:
+    """Box bottom of the object state nearest to a place (1, 2) or to a polygon (K, 2); None beyond 50 m."""
+    import shapely
+
+    if not len(truth.frame_ix):
+        return None
+    place = shapely.Point(corners[0]) if len(corners) == 1 else shapely.Polygon(corners)
+    distance = shapely.distance(place, shapely.points(truth.x_m[0], truth.y_m[0]))
+    nearest = int(np.argmin(distance))
+    if distance[nearest] > GROUND_WITHIN_M:
+        return None
+    return float(truth.z_m[0, nearest] - truth.height_m[0, nearest] / 2)
+
+
+def unit_ground(truth: Tracks, name: str, unit: Unit, notes: list[str]) -> float:
+    """Ground under a fixed unit; 0 for a carried one, which brings its own. What was assumed goes to `notes`."""
+    if unit.at is None:
+        return 0.0
+    return _ground(truth, unit.ground_z_m, np.array([unit.at]), f"unit {name}", notes)
+
+
+def place_obstacles(truth: Tracks, obstacles: tuple[Obstacle, ...], notes: list[str]) -> Statics:
+    """The experiment's static obstacles on their ground."""
+    if not obstacles:
+        return NO_STATICS
+    polygons = [np.array(o.polygon_m) for o in obstacles]
+    grounds = [
+        _ground(truth, o.ground_z_m, polygon, f"obstacle {k}", notes)
+        for k, (o, polygon) in enumerate(zip(obstacles, polygons, strict=True))
+    ]
+    return statics(polygons, grounds, [o.height_m for o in obstacles])
+
+
+def _ground(truth: Tracks, given_m: float | None, corners: Float, who: str, notes: list[str]) -> float:
+    if given_m is not None:
+        return given_m
+    found = ground_at(truth, corners)
+    if found is None:
+        notes.append(f"{who}: no object within {GROUND_WITHIN_M:g} m, ground taken as z = 0 (give ground_z_m)")
+        return 0.0
+    return found

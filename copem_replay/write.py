@@ -1,0 +1,123 @@
+"""MCAP out: the input's channels with their messages untouched, and what each configuration believed.
+
+For each configuration two channels: `copem/<configuration>/objects` (osi3.SensorData) and `copem/<configuration>/scene`
+(foxglove.SceneUpdate), one message per fused list, log_time = publish_time = the instant it was available. The same
+input gives the same bytes; the file appears under its name when it is complete, or not at all.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from mcap.records import Message
+from mcap.writer import Writer
+
+from copem_replay.colours import configuration_colours
+from copem_replay.errors import OutputError
+from copem_replay.formats import foxglove, sensor_data
+from copem_replay.passthrough import Catalogue, Original
+from copem_replay.tracks import Scene, Tracks
+
+OSI_RECORD = "net.asam.osi.trace"
+"""The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
+OSI_CHANNEL = "net.asam.osi.trace.channel."
+
+
+def write_mcap(path: Path, source: Path, scene: Scene, beliefs: Mapping[str, Tracks]) -> None:
+    """`source` with the fused lists of one run added: `beliefs[configuration]` has values (1, P).
+
+    Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
+    """
+    original = Original(source)
+    colours = configuration_colours(beliefs)
+    osi_version = ".".join(map(str, sensor_data.OSI_VERSION))
+    protobuf = version("protobuf")
+    with atomic_mcap(path, profile=original.profile) as writer:
+        catalogue = Catalogue(writer)
+        streams = [original.messages(original.register(catalogue))]
+        list_schema = _schema(catalogue, sensor_data.message_class(), sensor_data.SCHEMA)
+        scene_schema = _schema(catalogue, foxglove.message_class(), foxglove.SCHEMA)
+        for name, fused in beliefs.items():
+            description = {
+                f"{OSI_CHANNEL}description": f"fused object list of configuration {name}",
+                f"{OSI_CHANNEL}osi_version": osi_version,
+                f"{OSI_CHANNEL}protobuf_version": protobuf,
+            }
+            objects = catalogue.channel(f"copem/{name}/objects", "protobuf", list_schema, description)
+            scenes = catalogue.channel(f"copem/{name}/scene", "protobuf", scene_schema, {})
+            lists = sensor_data.SensorDataWriter(scene, fused)
+            boxes = foxglove.SceneWriter(scene, fused, name, colours[name])
+            streams.append(_lists(scene, fused, {objects: lists, scenes: boxes}))
+        for name, record in original.metadata.items():
+            if name != OSI_RECORD:
+                writer.add_metadata(name, record)
+        writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version, protobuf))
+        for message in heapq.merge(*streams, key=lambda m: m.log_time):
+            writer.add_message(
+                message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
+            )
+
+
+def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, Any]) -> Iterator[Message]:
+    for frame, available_s in enumerate(fused.arrives_s[0].tolist()):
+        available_ns = scene.t0_ns + round(available_s * 1e9)
+        for channel, writer in writers.items():
+            yield Message(channel, available_ns, writer.message(frame, available_ns), available_ns, 0)
+
+
+def _schema(catalogue: Catalogue, message_class: Any, name: str) -> int:
+    from mcap_protobuf.schema import build_file_descriptor_set
+
+    data = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)
+    return catalogue.schema(name, "protobuf", data)
+
+
+def _osi_record(original: Original, osi_version: str, protobuf: str) -> dict[str, str]:
+    """The input's record, its ranges of versions widened to ours; a new one where it had none."""
+    record = dict(original.metadata.get(OSI_RECORD, {}))
+    for what, ours in (("osi", osi_version), ("protobuf", protobuf)):
+        key = f"{OSI_CHANNEL}{what}_version"
+        seen = [ours, *(c.metadata[key] for c in original.channels.values() if key in c.metadata)]
+        for end, pick in (("min", min), ("max", max)):
+            name = f"{end}_{what}_version"
+            record[name] = pick([*seen, *([record[name]] if record.get(name) else [])], key=_release)
+    record["version"] = record.get("version") or osi_version
+    return dict(sorted(record.items()))
+
+
+def _release(text: str) -> tuple[int, ...]:
+    return tuple(int(part) if part.isdigit() else 0 for part in text.split("."))
+
+
+@contextmanager
+def atomic_mcap(path: Path, *, profile: str) -> Iterator[Writer]:
+    """A writer whose file gets its name when it is complete; whatever goes wrong before leaves nothing behind."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
+    try:
+        with os.fdopen(handle, "wb") as file:
+            writer = Writer(file, enable_data_crcs=True)
+            writer.start(profile=profile, library="copem_replay")
+            yield writer
+            writer.finish()
+            file.flush()
+            os.fsync(file.fileno())
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)  # mkstemp makes files for the owner only
+        os.replace(name, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        with suppress(FileNotFoundError):
+            os.unlink(name)

@@ -1,0 +1,248 @@
+"""Make the sample recordings in `logs/`: the same bytes on every call.
+
+    python tools/make_logs.py [tc016d …] [--out logs]
+
+A recording is an OSI multi-channel trace (MCAP). A further one is a function that returns a `Recording`, in a
+module beside this one, say, and an entry in `recipes`. Axes in metres: x along the road, y to its left, z up.
+Times in seconds since the first frame, which has stamp 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import google.protobuf
+import osi3
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+from osi3.osi_groundtruth_pb2 import GroundTruth
+from osi3.osi_object_pb2 import MovingObject, StationaryObject
+
+Kind = MovingObject.VehicleClassification
+NANOS_PER_SECOND: Final = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What goes into one file."""
+
+    description: str
+    topics: Mapping[str, str]  # topic: what is on it
+    messages: Iterable[tuple[str, Any]]  # (topic, message), in the order of their `timestamp`
+
+
+# What moves, and how ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Body:
+    """A box on the ground that stands, drives straight on, and may start late or brake to a stop."""
+
+    id: int
+    size_m: tuple[float, float, float]  # length, width, height
+    at_m: tuple[float, float]  # box centre at time 0
+    yaw_deg: float = 0.0
+    speed_mps: float = 0.0
+    starts_s: float = 0.0  # stands until then, and is at full speed in that very frame
+    brakes_s: float = math.inf
+    deceleration_mps2: float = 0.0
+    vehicle: int | None = Kind.TYPE_MEDIUM_CAR  # None: a pedestrian
+
+    def speed(self, time_s: float) -> float:
+        """Speed at `time_s`, in m/s."""
+        braked_mps = self.deceleration_mps2 * max(0.0, time_s - self.brakes_s)
+        return max(0.0, self.speed_mps - braked_mps) if time_s >= self.starts_s else 0.0
+
+    def travelled(self, time_s: float) -> float:
+        """Way from `at_m` at `time_s`, in m."""
+        way_m = self.speed_mps * max(0.0, min(time_s, self.brakes_s) - self.starts_s)
+        if time_s > self.brakes_s:  # the mean speed of a braking that is over is half the speed it began with
+            braking_s = min(time_s - self.brakes_s, self.speed_mps / self.deceleration_mps2)
+            way_m += braking_s * (self.speed_mps + self.speed(time_s)) / 2
+        return way_m
+
+
+def _along(yaw_rad: float, length: float) -> tuple[float, float]:
+    """Return the vector of a direction, rounded: no platform's sine shows in the bytes, and no −0.0."""
+    x, y = round(length * math.cos(yaw_rad), 12), round(length * math.sin(yaw_rad), 12)
+    return x + 0.0, y + 0.0
+
+
+def _place(base: Any, body: Body, time_s: float) -> None:
+    """Set size and pose, which moving and stationary objects have in common."""
+    yaw_rad = math.radians(body.yaw_deg)
+    way_m = _along(yaw_rad, body.travelled(time_s))
+    base.dimension.length, base.dimension.width, base.dimension.height = body.size_m
+    base.position.x, base.position.y = (round(at + way, 12) for at, way in zip(body.at_m, way_m, strict=True))
+    base.position.z = body.size_m[2] / 2  # OSI places the centre of the box; the ground is z = 0
+    base.orientation.roll, base.orientation.pitch, base.orientation.yaw = 0.0, 0.0, yaw_rad
+
+
+def moving_object(body: Body, time_s: float) -> MovingObject:
+    """Return a body at a time as OSI has it."""
+    osi = MovingObject(type=MovingObject.TYPE_VEHICLE if body.vehicle else MovingObject.TYPE_PEDESTRIAN)
+    osi.id.value = body.id
+    _place(osi.base, body, time_s)
+    velocity_mps = _along(math.radians(body.yaw_deg), body.speed(time_s))
+    osi.base.velocity.x, osi.base.velocity.y, osi.base.velocity.z = *velocity_mps, 0.0
+    if body.vehicle:
+        osi.vehicle_classification.type = body.vehicle
+        rear = (
+            osi.vehicle_attributes.bbcenter_to_rear
+        )  # chosen: 0.3 of the length behind the centre, 0.3 m up
+        rear.x, rear.y, rear.z = -0.3 * body.size_m[0], 0.0, 0.3 - body.size_m[2] / 2
+    return osi
+
+
+def stationary_object(body: Body) -> StationaryObject:
+    """Return a body that never moves as OSI has it."""
+    osi = StationaryObject()
+    osi.id.value = body.id
+    _place(osi.base, body, 0.0)
+    osi.classification.type = StationaryObject.Classification.TYPE_OTHER
+    return osi
+
+
+def ground_truth(stamp_ns: int, moving: list[Body], stationary: list[Body], host_id: int) -> GroundTruth:
+    """Return all bodies at one instant."""
+    osi = GroundTruth()
+    parts = (int(part) for part in osi3.__version__.split(".")[:3])
+    osi.version.version_major, osi.version.version_minor, osi.version.version_patch = parts
+    osi.timestamp.seconds, osi.timestamp.nanos = divmod(stamp_ns, NANOS_PER_SECOND)
+    osi.host_vehicle_id.value = host_id
+    osi.moving_object.extend(moving_object(body, stamp_ns / NANOS_PER_SECOND) for body in moving)
+    osi.stationary_object.extend(stationary_object(body) for body in stationary)
+    return osi
+
+
+# tc016d: a truck hides a pedestrian -------------------------------------------------------------------------
+
+TC016D_RATE_HZ: Final = 10
+TC016D_FRAMES: Final = 81
+TC016D_ONSET_S: Final = 3.0
+_EGO_START_M: Final = -(20.0 + 4.6 / 2 + 10.0 * TC016D_ONSET_S) + 1e-10
+"""At the onset its front is 20 m from the pedestrian; 0.1 nm less, or rounding might delay it by a frame."""
+
+
+def tc016d_bodies() -> tuple[list[Body], list[Body]]:
+    """Return what moves and what doesn't. The pedestrian walks along x = 0, the ego drives along y = 0.
+
+    The truck's road side is at y = −2.12 and its front at x = −0.75, half a metre before the pedestrian. Past
+    that corner the ego sees nothing of him until 0.5 s after his first step, 18 % at 0.6 s, all at 1.1 s.
+    """
+    car = Body(id=0, size_m=(4.4, 1.8, 1.5), at_m=(0.0, 0.0), speed_mps=10.0)
+    walker = Body(id=0, size_m=(0.5, 0.5, 1.8), at_m=(0.0, 0.0), vehicle=None)
+    moving = [
+        replace(car, id=1, size_m=(4.6, 1.9, 1.5), at_m=(_EGO_START_M, 0.0)),
+        replace(walker, id=2, at_m=(0.0, -3.0), yaw_deg=90.0, speed_mps=1.0, starts_s=TC016D_ONSET_S),
+        Body(id=3, size_m=(8.0, 2.5, 3.5), at_m=(-4.75, -3.37), vehicle=Kind.TYPE_HEAVY_TRUCK),
+        # Two oncoming cars: one has passed the crossing, the other stops before it because of the pedestrian.
+        replace(car, id=4, at_m=(-8.0, 3.5), yaw_deg=180.0, speed_mps=11.0),
+        replace(car, id=5, at_m=(100.0, 3.5), yaw_deg=180.0, brakes_s=4.0, deceleration_mps2=1.25),
+        # One behind the ego that brakes once the pedestrian is in sight, and a cyclist well ahead.
+        replace(car, id=6, at_m=(-82.3, 0.0), brakes_s=4.5, deceleration_mps2=2.5),
+        Body(id=7, size_m=(1.8, 0.6, 1.7), at_m=(12.0, -1.4), speed_mps=4.5, vehicle=Kind.TYPE_BICYCLE),
+        replace(walker, id=8, at_m=(60.0, 8.0), yaw_deg=-90.0),  # waits, far down the other sidewalk
+    ]
+    shelter = Body(id=9, size_m=(4.0, 1.6, 2.5), at_m=(4.0, -6.2))
+    return moving, [shelter]
+
+
+def tc016d_units() -> list[dict[str, Any]]:
+    """Return twenty roadside units on masts, ten on either side, which face the crossing point (0, 0).
+
+    Up to the instant at which the ego would hit him, all of them see more than 95 % of the pedestrian.
+    """
+    masts_m = [  # x, y, height; none far to the west, where the truck or the ego would be in between
+        (-1.0, -9.0, 5.0), (0.0, -8.0, 4.0), (1.0, -9.5, 6.0), (7.5, -5.0, 4.5), (9.0, -5.5, 5.0),
+        (10.5, -5.0, 5.5), (12.0, -5.5, 4.0), (14.0, -5.0, 5.0), (16.0, -5.5, 6.0), (18.0, -5.0, 4.5),
+        (-3.0, 10.0, 6.0), (-2.0, 8.0, 4.5), (-1.0, 7.0, 4.0), (0.0, 9.0, 5.0), (1.0, 7.5, 5.5),
+        (3.0, 8.5, 4.0), (5.0, 7.5, 4.5), (7.5, 9.0, 5.0), (10.0, 8.0, 5.5), (12.5, 9.5, 6.0),
+    ]  # fmt: skip
+    return [
+        {"at": [x, y], "yaw_deg": round(math.degrees(math.atan2(-y, -x)), 1), "height_m": height}
+        for x, y, height in masts_m
+    ]
+
+
+def tc016d() -> Recording:
+    """Return the scenario of the paper: a pedestrian steps out from behind a truck, 20 m ahead of the ego."""
+    moving, stationary = tc016d_bodies()
+    stamps_ns = (frame * NANOS_PER_SECOND // TC016D_RATE_HZ for frame in range(TC016D_FRAMES))
+    return Recording(
+        description="A parked truck hides a pedestrian who starts to cross 20 m ahead of the ego vehicle.",
+        topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users and the bus shelter"},
+        messages=(("ground_truth", ground_truth(t, moving, stationary, host_id=1)) for t in stamps_ns),
+    )
+
+
+def recipes() -> dict[str, Callable[[], Recording]]:
+    """Return every recording by the name of its file; recipes of other modules are imported in here."""
+    return {"tc016d": tc016d}
+
+
+# Writing ----------------------------------------------------------------------------------------------------
+
+
+def write_recording(recording: Recording, path: Path) -> None:
+    """Write an OSI multi-channel trace; the file is there in full or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with temporary.open("wb") as stream:
+            writer = Writer(stream, compression=CompressionType.ZSTD)
+            writer.start(profile="", library="copem_replay")
+            _write_content(writer, recording)
+            writer.finish()
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_content(writer: Writer, recording: Recording) -> None:
+    osi_version, protobuf_version = osi3.__version__, google.protobuf.__version__
+    trace = {
+        **dict.fromkeys(("version", "min_osi_version", "max_osi_version"), osi_version),
+        **dict.fromkeys(("min_protobuf_version", "max_protobuf_version"), protobuf_version),
+        "description": recording.description,
+        "authors": "copem_replay",
+        "data_sources": "synthetic (tools/make_logs.py)",
+    }  # neither creation_time nor zero_time: the first would be a clock, and the scene has no date
+    writer.add_metadata("net.asam.osi.trace", dict(sorted(trace.items())))
+    prefix = "net.asam.osi.trace.channel."
+    versions = {f"{prefix}osi_version": osi_version, f"{prefix}protobuf_version": protobuf_version}
+    schema_ids: dict[str, int] = {}
+    channel_ids: dict[str, int] = {}
+    for topic, message in recording.messages:
+        schema = message.DESCRIPTOR.full_name
+        if schema not in schema_ids:
+            files = build_file_descriptor_set(type(message)).SerializeToString(deterministic=True)
+            schema_ids[schema] = writer.register_schema(schema, "protobuf", files)
+        if topic not in channel_ids:
+            metadata = {f"{prefix}description": recording.topics[topic]} | versions
+            channel_ids[topic] = writer.register_channel(topic, "protobuf", schema_ids[schema], metadata)
+        stamp_ns = message.timestamp.seconds * NANOS_PER_SECOND + message.timestamp.nanos
+        data = message.SerializeToString(deterministic=True)
+        writer.add_message(channel_ids[topic], stamp_ns, data, publish_time=stamp_ns)
+
+
+def main() -> None:
+    logs = Path(__file__).resolve().parents[1] / "logs"
+    parser = argparse.ArgumentParser(description="Make the sample recordings.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(recipes())}; none: all")
+    parser.add_argument("--out", type=Path, default=logs, help="folder (default: the project's logs/)")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.names) - set(recipes()):
+        parser.error(f"no recipe for {', '.join(sorted(unknown))}; there are: {', '.join(recipes())}")
+    for name in arguments.names or recipes():
+        write_recording(recipes()[name](), arguments.out / f"{name}.mcap")
+
+
+if __name__ == "__main__":
+    main()
