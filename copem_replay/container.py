@@ -36,6 +36,8 @@ DAMAGE = (
     ValueError,  # includes checksums that fail and texts that are not UTF-8
     KeyError,
     RuntimeError,  # lz4
+    OSError,  # an index that points outside of the file
+    OverflowError,  # … far outside
     zstandard.ZstdError,
     MemoryError,  # a length that was hit
 )

@@ -17,7 +17,6 @@ from osi3.osi_sensorview_pb2 import SensorView
 SHARED = Path(__file__).parents[1].parent / "shared" / "data"
 """Recordings of third parties: not part of the project, absent from most machines."""
 
-UNSET = None
 VEHICLE, PEDESTRIAN, ANIMAL = 2, 3, 4  # osi3.MovingObject.Type
 CAR = 4  # osi3.MovingObject.VehicleClassification.Type
 
@@ -130,16 +129,9 @@ def write_mcap(
             numbered.sort(key=lambda message: message[:2])
         for log_ns, _, channel, data in numbered:
             out.add_message(channel, log_time=log_ns, publish_time=log_ns, data=data)
-        if finish:
+        if finish:  # else as a recorder leaves it that is killed
             out.finish()
-        else:  # as a recorder leaves it that is killed
-            file.write(_unfinished(out))
     return path
-
-
-def _unfinished(out: Writer) -> bytes:
-    """What a writer flushes that never comes to its end: nothing; its last chunk is lost."""
-    return b""
 
 
 def truth_topic(

@@ -157,7 +157,7 @@ def tc016d_bodies() -> tuple[list[Body], list[Body]]:
 def tc016d_units() -> list[dict[str, Any]]:
     """Return twenty roadside units on masts, ten on either side, which face the crossing point (0, 0).
 
-    Up to the instant at which the ego would hit him, all of them see more than 95 % of the pedestrian.
+    From the first frame until the ego runs into him each of them sees all of the pedestrian.
     """
     masts_m = [  # x, y, height; none far to the west, where the truck or the ego would be in between
         (-1.0, -9.0, 5.0), (0.0, -8.0, 4.0), (1.0, -9.5, 6.0), (7.5, -5.0, 4.5), (9.0, -5.5, 5.0),

@@ -1,0 +1,383 @@
+"""Show: one run of one log as a Rerun recording (.rrd), the truth beside every configuration, a blueprint inside.
+
+| entity | is |
+|---|---|
+| `world/truth/boxes`, `measured`, `paths` | the log: its boxes, names of what is measured, paths of these and the ego |
+| `world/static`, `world/units/<unit>` | the experiment's obstacles and units |
+| `world/<configuration>/boxes`, `covariance` | what the receiver believes, and 2σ of where |
+| `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
+| `plots/position_error/<object>/<configuration>` | believed to true position at the instant the list is available |
+| `events/<configuration>`, `summary` | in words |
+
+Columns are sent whole, an entity holds all its objects: hundreds of entities slow the viewer down. It shows the newest
+row of an entity until the next one, so an instant at which there is nothing has an empty row of its own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from copem_replay.colours import Rgb, configuration_colours
+from copem_replay.errors import OutputError
+from copem_replay.experiment import Experiment
+from copem_replay.replay import Replay
+from copem_replay.resample import states_at
+from copem_replay.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, Scene, Tracks
+from copem_replay.units import carrier, list_instants
+from copem_replay.visibility import Statics
+
+if TYPE_CHECKING:  # a second to import: only where something is written
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+ELAPSED, TIME = "elapsed", "time"
+"""The two timelines: since the log's start, and the log's own clock."""
+SHOWN_OBJECTS, SHOWN_CONFIGURATIONS = 6, 6
+"""How many measured objects are plotted and configurations have a view of their own (chosen)."""
+LAYOUT = 1
+"""Counts up when the blueprint changes: the viewer keeps one per application id and prefers what it has."""
+SMALLEST_VARIANCE_M2 = 1e-6
+"""Positions known better than this have no ellipse (chosen: 2 mm would not be seen)."""
+
+_STANDING, _EGO = 100, 200  # class ids: moving objects have the index of their class
+_RESERVED = ("truth", "static", "units")
+_VRU, _VEHICLE, _OTHER, _EGO_RGB = (235, 120, 140), (135, 155, 185), (160, 160, 160), (245, 245, 245)
+
+
+def write_rrd(
+    path: Path,
+    replay: Replay,
+    experiment: Experiment,
+    beliefs: Mapping[str, Tracks],
+    table: pd.DataFrame,
+    summary: pd.DataFrame,
+    run: int,
+) -> None:
+    """Write one run of one log. Raises OutputError.
+
+    `beliefs`: per configuration what the receiver believes in this run, a frame per list it issued (one unit, values
+    (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and runs.
+    """
+    import rerun as rr
+
+    shown = [replay.scene.object_number[name] for name in table["object_id"].unique()[:SHOWN_OBJECTS]]
+    blueprint, layout = _blueprint(replay, table, list(beliefs), shown)
+    identity = _digest(experiment.model_dump_json(), replay.scene.log, str(run))
+    strict = rr.strict_mode()
+    rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp") as folder:
+            scratch = Path(folder) / "recording.rrd"
+            with rr.RecordingStream(f"copem_replay:{layout}", recording_id=identity, send_properties=False) as rec:
+                rec.save(scratch, default_blueprint=blueprint)
+                _fill(_Out(rec, replay.scene.t0_ns), replay, experiment, beliefs, table, summary, run, shown)
+            if not scratch.exists():
+                raise OutputError(f"{path}: Rerun wrote nothing; is RERUN=off in the environment?")
+            os.replace(scratch, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        rr.set_strict_mode(strict)
+
+
+@dataclass(frozen=True)
+class _Out:
+    """The recording as it is written."""
+
+    rec: rr.RecordingStream
+    t0_ns: int
+
+    def static(self, path: list[str], *what: Any) -> None:
+        """What holds at all times."""
+        self.rec.log(path, *what, static=True)
+
+    def columns(self, path: list[str], elapsed_ns: Int, columns: Any, counts: Int) -> None:
+        """At each instant (F,) as many of the instances as `counts` (F,) says; none clears what was there."""
+        import rerun as rr
+
+        if len(elapsed_ns):
+            times = [
+                rr.TimeColumn(ELAPSED, duration=elapsed_ns.astype("timedelta64[ns]")),
+                rr.TimeColumn(TIME, timestamp=(self.t0_ns + elapsed_ns).astype("datetime64[ns]")),
+            ]
+            self.rec.send_columns(rr.new_entity_path(path), times, columns.partition(counts))
+
+    def series(self, path: list[str], elapsed_ns: Int, values: Float, *style: Any) -> None:
+        """A number per instant (F,); an empty row where NaN begins breaks the line."""
+        import rerun as rr
+
+        known = ~np.isnan(values)
+        kept = known | np.append(False, known[:-1])[: len(known)]
+        self.columns(path, elapsed_ns[kept], rr.Scalars.columns(scalars=values[known]), known[kept].astype(np.int64))
+        self.static(path, *style)
+
+
+def _fill(
+    out: _Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Tracks], table: pd.DataFrame,
+    summary: pd.DataFrame, run: int, shown: Sequence[int],
+) -> None:  # fmt: skip
+    import rerun as rr
+
+    scene = replay.scene
+    _properties(out, replay, experiment, list(beliefs), run)
+    out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, _class_colours())
+    _truth(out, scene, replay.truth, shown)
+    _statics(out, replay.found.static)
+    _units(out, replay, experiment)
+    _visible_shares(out, replay, experiment, shown)
+    for name, colour in configuration_colours(beliefs).items():
+        part = _part(name)
+        _boxes(out, ["world", part, "boxes"], scene, beliefs[name], scene.object_class.astype(np.uint16))
+        solid = rr.components.FillMode.TransparentFillMajorWireframe
+        style = rr.Boxes3D.from_fields(colors=[(*colour, 150)], radii=0.04, fill_mode=solid, show_labels=False)
+        out.static(["world", part, "boxes"], style)
+        _covariance(out, ["world", part, "covariance"], beliefs[name], colour)
+        _position_errors(out, replay, experiment, name, beliefs[name], shown, colour)
+        _events(out, ["events", part], table[table["configuration"] == name])
+    title = f"## {scene.log}: run {run}\n\nSeed {experiment.seed}, visibility `{experiment.visibility}`. The views show "
+    text = f"{title}this run, the table is over all runs and logs.\n\n{_markdown(summary)}"
+    out.static(["summary"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _properties(out: _Out, replay: Replay, experiment: Experiment, configurations: list[str], run: int) -> None:
+    import rerun as rr
+
+    out.rec.send_recording_name(f"{replay.scene.log}: run {run}")
+    out.rec.send_recording_start_time_nanos(replay.scene.t0_ns)
+    values = rr.AnyValues(
+        log=replay.scene.log,
+        run=run,
+        seed=experiment.seed,
+        visibility=experiment.visibility,
+        configurations=configurations,
+        copem_replay=version("copem-replay"),
+        rerun_sdk=version("rerun-sdk"),
+    )
+    out.rec.send_property("replay", values)
+
+
+# The world ------------------------------------------------------------------------------------------------------
+
+
+def _class_colours() -> rr.AnnotationContext:
+    import rerun as rr
+
+    groups = {"vru": _VRU, "vehicles": _VEHICLE}
+    colour_of = {name: colour for group, colour in reversed(groups.items()) for name in CLASS_GROUPS[group]}
+    infos = [rr.AnnotationInfo(_EGO, "ego", _EGO_RGB)]
+    for k, name in enumerate(CLASSES):
+        colour = colour_of.get(name, _OTHER)
+        infos.append(rr.AnnotationInfo(k, name, colour))
+        infos.append(rr.AnnotationInfo(_STANDING + k, f"{name}, stationary", tuple(c // 2 for c in colour)))
+    return rr.AnnotationContext(infos)
+
+
+def _truth(out: _Out, scene: Scene, truth: Tracks, shown: Sequence[int]) -> None:
+    import rerun as rr
+
+    class_ids = scene.object_class.astype(np.uint16) + np.where(scene.moving, 0, _STANDING).astype(np.uint16)
+    if scene.ego_ix >= 0:
+        class_ids[scene.ego_ix] = _EGO
+    _boxes(out, ["world", "truth", "boxes"], scene, truth, class_ids)
+    wireframe = rr.components.FillMode.MajorWireframe
+    out.static(["world", "truth", "boxes"], rr.Boxes3D.from_fields(fill_mode=wireframe, radii=0.03, show_labels=False))
+    rows, counts = _by_frame(truth, np.isin(truth.row_object_ix, shown))
+    above = _f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] + truth.height_m[0, rows] / 2 + 0.5)
+    labels = _labels(scene).take(pa.array(truth.row_object_ix[rows]))
+    names = rr.Points3D.columns(positions=above, labels=labels)
+    out.columns(["world", "truth", "measured"], _elapsed_ns(truth), names, counts)
+    small = rr.Points3D.from_fields(colors=[_VRU], radii=rr.Radius.ui_points(1.5), show_labels=True)
+    out.static(["world", "truth", "measured"], small)
+    out.static(["world", "truth", "paths"], _paths(truth, [*shown, scene.ego_ix]))
+
+
+def _paths(truth: Tracks, objects: Sequence[int]) -> rr.LineStrips3D:
+    """The ways of some objects on the ground, broken where one is absent for a while."""
+    import rerun as rr
+
+    rows = np.flatnonzero(np.isin(truth.row_object_ix, objects))
+    ground = _f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] - truth.height_m[0, rows] / 2)
+    broken = (np.diff(truth.track_ix[rows]) != 0) | (np.diff(truth.frame_ix[rows]) != 1)
+    strips = np.split(ground, np.flatnonzero(broken) + 1) if len(rows) else []
+    return rr.LineStrips3D(strips, colors=[(*_OTHER, 90)], radii=0.03)
+
+
+def _statics(out: _Out, static: Statics) -> None:
+    """Obstacles as prisms: a wall per edge, each with its own corners so that it is shaded flat, and a lid."""
+    import rerun as rr
+
+    if not len(static.body):
+        return
+    sizes = np.diff(static.start)
+    part, here = np.repeat(np.arange(len(sizes)), sizes), np.arange(len(static.xy_m))
+    there = here + 1
+    there[static.start[1:] - 1] = static.start[:-1]
+    a, b = static.xy_m[here], static.xy_m[there]
+    bottom, top = static.bottom_m[part], static.top_m[part]
+    corners = [_f32(*a.T, bottom), _f32(*b.T, bottom), _f32(*b.T, top), _f32(*a.T, top)]
+    outward = _f32((b - a)[:, 1], -(b - a)[:, 0], np.zeros(len(a)))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    up = np.tile(np.float32([0, 0, 1]), (len(a), 1))
+    walls = (4 * here[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    fan = (here != static.start[part]) & (there != static.start[part])
+    lid = 4 * len(a) + np.stack([static.start[part], here, there], axis=-1)[fan]
+    mesh = rr.Mesh3D(
+        vertex_positions=np.concatenate([np.stack(corners, axis=1).reshape(-1, 3), corners[3]]),
+        vertex_normals=np.concatenate([np.repeat(outward, 4, axis=0), up]),
+        triangle_indices=np.concatenate([walls, lid]),
+        albedo_factor=(110, 110, 110),
+    )
+    out.static(["world", "static"], mesh)
+
+
+def _units(out: _Out, replay: Replay, experiment: Experiment) -> None:
+    import rerun as rr
+
+    for name, unit in experiment.units.items():
+        at, path = replay.found.poses[name], ["world", "units", name]
+        place, there = _f32(at.x_m, at.y_m, at.z_m), at.present
+        if unit.at is not None:
+            out.static(path, rr.Points3D.from_fields(positions=place[:1]))
+        else:
+            elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
+            out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]), there.astype(np.int64))
+        mark = rr.Radius.ui_points(4)
+        out.static(path, rr.Points3D.from_fields(colors=[_EGO_RGB], radii=mark, labels=[name], show_labels=True))
+
+
+def _boxes(out: _Out, path: list[str], scene: Scene, tracks: Tracks, class_ids: np.ndarray) -> None:
+    """All boxes of `tracks`, list by list, from the instant each list is available. `class_ids` (N,)."""
+    import rerun as rr
+
+    rows, counts = _by_frame(tracks, tracks.valid[0])
+    object_ix = tracks.row_object_ix[rows]
+    columns = rr.Boxes3D.columns(
+        centers=_f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
+        half_sizes=_f32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,
+        quaternions=_upright(tracks.yaw_rad[0, rows]),
+        class_ids=class_ids[object_ix],
+        labels=_labels(scene).take(pa.array(object_ix)),
+    )
+    out.columns(path, _elapsed_ns(tracks), columns, counts)
+
+
+def _covariance(out: _Out, path: list[str], tracks: Tracks, colour: Rgb) -> None:
+    """2σ ellipses of the position, lying under the boxes; none where it is exact."""
+    import rerun as rr
+
+    if tracks.cov_ee_m2 is None or tracks.cov_en_m2 is None or tracks.cov_nn_m2 is None:
+        return
+    a, b, d = tracks.cov_ee_m2[0], tracks.cov_en_m2[0], tracks.cov_nn_m2[0]
+    turn = np.hypot((a - d) / 2, b)
+    high, low = (a + d) / 2 + turn, (a + d) / 2 - turn
+    rows, counts = _by_frame(tracks, tracks.valid[0] & (high > SMALLEST_VARIANCE_M2))
+    if not len(rows):
+        return
+    columns = rr.Ellipsoids3D.columns(
+        centers=_f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows] - tracks.height_m[0, rows] / 2),
+        half_sizes=_f32(
+            2 * np.sqrt(high[rows]), 2 * np.sqrt(np.maximum(low[rows], SMALLEST_VARIANCE_M2)), np.full(len(rows), 0.01)
+        ),
+        quaternions=_upright(np.arctan2(b, (a - d) / 2)[rows] / 2),
+    )
+    out.columns(path, _elapsed_ns(tracks), columns, counts)
+    solid = rr.components.FillMode.Solid
+    out.static(path, rr.Ellipsoids3D.from_fields(colors=[(*colour, 70)], fill_mode=solid))
+
+
+# Plots and words ------------------------------------------------------------------------------------------------
+
+
+def _visible_shares(out: _Out, replay: Replay, experiment: Experiment, shown: Sequence[int]) -> None:
+    import rerun as rr
+
+    scene, tracks, max_gap_ns = replay.scene, replay.measured.tracks, experiment.max_gap_s * 1e9
+    stamps = np.unique(tracks.stamp_ns)
+    newest = np.full((len(tracks.units), len(stamps)), -1)  # each unit's newest list at each instant
+    for unit in range(len(tracks.units)):
+        mine = np.flatnonzero(tracks.frame_unit_ix == unit)
+        at = np.searchsorted(tracks.stamp_ns[mine], stamps, side="right") - 1
+        known = at >= 0
+        known[known] = (stamps[known] - tracks.stamp_ns[mine[at[known]]]) <= max_gap_ns
+        newest[unit, known] = mine[at[known]]
+    carriers = np.array([carrier(scene, unit) for unit in experiment.units.values()], dtype=np.int64)
+    own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
+    styles = (("ego", own, _EGO_RGB, 3.0), ("any unit", np.ones_like(own), (0, 158, 115), 1.5))
+    for k in shown:
+        share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
+        rows = np.flatnonzero(tracks.row_object_ix == k)
+        share[tracks.frame_ix[rows]] = replay.measured.look.visible_share[rows]
+        for name, units, colour, width in styles:
+            if units.any():
+                # A unit without a list of the object says nothing about it: the best of the others counts.
+                best = np.fmax.reduce(share[newest[units]], axis=0)
+                lines = rr.SeriesLines(names=name, colors=colour, widths=width)
+                out.series(["plots", "visible_share", scene.object_ids[k], name], stamps - scene.t0_ns, best, lines)
+
+
+def _position_errors(
+    out: _Out, replay: Replay, experiment: Experiment, name: str, fused: Tracks, shown: Sequence[int], colour: Rgb
+) -> None:
+    import rerun as rr
+
+    style = rr.SeriesLines(names=name, colors=colour, widths=1.5)
+    for k in shown:
+        rows = np.flatnonzero((fused.row_object_ix == k) & fused.valid[0])
+        frames = fused.frame_ix[rows]
+        at, _ = states_at(
+            replay.truth, np.full(len(rows), k), fused.arrives_s[0, frames],
+            t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s,
+        )  # fmt: skip
+        error = np.full(len(fused.stamp_ns), np.nan)
+        error[frames] = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])
+        out.series(["plots", "position_error", replay.scene.object_ids[k], name], _elapsed_ns(fused), error, style)
+
+
+def _events(out: _Out, path: list[str], part: pd.DataFrame) -> None:
+    """Onset of each object, and how its look ended. `part`: the rows of one configuration."""
+    import rerun as rr
+
+    who = part["object_id"].astype(str) + " " + part["object_class"].astype(str) + ": "
+    seen, lost = part["detected"].to_numpy(dtype=bool), ~part["detected"].to_numpy(dtype=bool)
+    at_start = np.where(part["onset_at_start"], ", already at its first frame", "")
+    late = part["time_to_detection_s"]
+    when = late.abs().map("{:.2f} s ".format) + np.where(late < 0, "before", "after") + " the onset"
+    far = part["distance_at_detection_m"].map(", at {:.1f} m".format).mask(part["distance_at_detection_m"].isna(), "")
+    endings = {
+        "object_left": "left undetected",
+        "ego_left": "undetected when the ego left",
+        "log_end": "log ended, undetected",
+    }
+    found = who + "detected by " + part["first_unit"].astype(str) + " " + when + far
+    text = pd.concat([who + "onset" + at_start, found[seen], (who + part["ended_by"].map(endings))[lost]])
+    time_s = np.concatenate([part["onset_s"], part["detection_s"][seen], part["ended_s"][lost]]).astype(float)
+    level = np.repeat(["INFO", "INFO", "WARN"], [len(part), seen.sum(), lost.sum()])
+    order = np.argsort(time_s, kind="stable")
+    columns = rr.TextLog.columns(text=text.to_numpy(dtype=object)[order].tolist(), level=level[order].tolist())
+    out.columns(path, _ns(time_s[order]), columns, np.ones(len(order), dtype=np.int64))
+
+
+def _markdown(frame: pd.DataFrame) -> str:
+    """A table with a column per row of `frame`: configurations side by side."""
+
+    def cell(value: object) -> str:
+        if value is None or value is pd.NA or (isinstance(value, float) and np.isnan(value)):
+            return "–"
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        return text.replace("|", "\\|")
+
+    lines = [[name, *(cell(value) for value in frame[name])] for name in frame.columns]
+    lines.insert(1, ["---"] + ["---:"] * len(frame))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,246 @@
+"""MCAP files as they come: sound, without index, cut off, hit, and files that are none."""
+
+import random
+from pathlib import Path
+
+import pytest
+from copem_replay import container
+from copem_replay.errors import RecordingError
+from copem_replay.read import Recording, read
+from mcap.writer import CompressionType, IndexType
+
+from recordings import Obj, Topic, truth_topic, write_mcap, write_recording
+
+# Ten frames 0.1 s apart; with `chunk_size=1` every message has a chunk of its own.
+FRAMES = [(k / 10, [Obj(id=1, x=10.0 * k, vx=100.0)]) for k in range(10)]
+CUT_OFF = "the file ends too early"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.mcap"
+
+
+def problem(path: Path) -> str:
+    """The one line that says why a file cannot be read."""
+    with pytest.raises(RecordingError) as caught:
+        read(path, name="log")
+    (line,) = caught.value.problems
+    assert "\n" not in line
+    assert line.startswith(f"{path}: ")
+    return line.removeprefix(f"{path}: ")
+
+
+def outcome(path: Path) -> Recording | tuple[str, ...]:
+    """What reading gives: a recording, or the lines that say why not. Anything else is a defect."""
+    try:
+        return read(path, name="log")
+    except RecordingError as error:
+        return error.problems
+
+
+# ------------------------------------------------------------------------------- files that are none
+
+
+def test_absent_file(path):
+    assert problem(path) == "no such file"
+
+
+def test_directory(tmp_path):
+    assert problem(tmp_path) == "expected an MCAP file, found a directory"
+
+
+def test_empty_file(path):
+    path.touch()
+    assert problem(path) == "the file is empty"
+
+
+def test_git_lfs_pointer(path):
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    assert problem(path) == "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
+
+
+def test_another_format_says_what_it_starts_with(path):
+    path.write_bytes(b"#ROSBAG V2.0\n" + bytes(200))
+    assert problem(path) == r"expected an MCAP file, found one that starts with b'#ROSBAG V2.0\n\x00\x00\x00'"
+
+
+def test_nothing_but_the_magic(path):
+    path.write_bytes(container.MAGIC)
+    assert problem(path) == f"damaged, and no message can be read ({CUT_OFF})"
+
+
+def test_file_without_permission_to_read(path, monkeypatch):
+    write_recording(path, FRAMES)
+
+    def refuse(self, *_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    assert problem(path) == "cannot be opened: Permission denied"
+
+
+# ------------------------------------------------------------------------------- sound files of every kind
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.NONE},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.ZSTD},
+        {"chunk_size": 1},
+        {"enable_data_crcs": True},
+        {"enable_crcs": False},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK},
+        {"index_types": IndexType.MESSAGE},
+        {"use_chunking": False},
+        {"use_statistics": False},
+        {"repeat_channels": False},
+        {"repeat_schemas": False},
+        {"repeat_channels": False, "use_statistics": False},
+        {"profile": "osi2mcap"},
+        {"profile": "ros2"},
+    ],
+    ids=str,
+)
+def test_all_kinds_of_files_read_the_same_and_need_no_note(path, options):
+    recording = read(write_recording(path, FRAMES, **options), name="log")
+    assert recording.truth.x_m[0].tolist() == [0, 10, 20, 30, 40, 50, 60, 70, 80, 90]
+    assert recording.notes == ()
+    assert recording.damage is None
+
+
+def test_channels_of_one_topic_and_of_one_schema_name_are_kept_apart(path):
+    topics = [truth_topic(FRAMES[:5]), truth_topic(FRAMES[5:]), Topic("truth", "", [(0, b"x")], "json")]
+    write_mcap(path, topics)
+    assert [c.messages for c in container.open_log(path).channels] == [5, 5, 1]
+    recording = read(path, name="log")
+    assert len(recording.truth.stamp_ns) == 10
+    assert recording.notes == ("1 message of no schema (json) not read",)
+
+
+# ------------------------------------------------------------------------------- damaged files
+
+
+def last_chunk_start(path: Path) -> int:
+    """Where the file's last chunk begins."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        return make_reader(file).get_summary().chunk_indexes[-1].chunk_start_offset
+
+
+def test_cut_off_in_a_chunk(path):
+    write_recording(path, FRAMES, chunk_size=1)
+    path.write_bytes(path.read_bytes()[: last_chunk_start(path) + 30])
+    recording = read(path, name="log")
+    assert recording.truth.x_m[0].tolist() == [0, 10, 20, 30, 40, 50, 60, 70, 80]
+    assert recording.damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
+    assert recording.notes == (recording.damage,)
+
+
+def test_cut_off_between_records(path):
+    write_recording(path, FRAMES, chunk_size=1)
+    path.write_bytes(path.read_bytes()[: last_chunk_start(path)])
+    assert read(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
+
+
+def test_cut_off_in_the_only_chunk(path):
+    write_recording(path, FRAMES)
+    path.write_bytes(path.read_bytes()[: last_chunk_start(path) + 60])
+    assert problem(path) == f"damaged, and no message can be read ({CUT_OFF})"
+
+
+def test_cut_off_in_a_message_without_chunks(path):
+    write_recording(path, FRAMES, use_chunking=False)
+    data = path.read_bytes()
+    end_of_data = data.rindex(FRAMES_LAST := truth_topic(FRAMES).messages[-1][1]) + len(FRAMES_LAST)
+    path.write_bytes(data[: end_of_data - 3])
+    assert read(path, name="log").damage == f"damaged after 0.800 s: 9 messages read ({CUT_OFF})"
+
+
+def test_recorder_was_killed(path):
+    write_recording(path, FRAMES, chunk_size=1, finish=False)
+    recording = read(path, name="log")
+    assert len(recording.truth.stamp_ns) == 10
+    assert recording.damage == f"damaged after 0.900 s: 10 messages read ({CUT_OFF})"
+
+
+def test_last_bytes_missing(path):
+    write_recording(path, FRAMES)
+    path.write_bytes(path.read_bytes()[:-10])
+    recording = read(path, name="log")
+    assert len(recording.truth.stamp_ns) == 10
+    assert recording.damage == (
+        f"damaged: its index cannot be used ({CUT_OFF}): read from start to end, no message is lost"
+    )
+
+
+def test_hit_in_the_index(path):
+    write_recording(path, FRAMES)
+    data = bytearray(path.read_bytes())
+    data[data.rindex(b"osi3.GroundTruth")] ^= 1  # the schema's name is no longer that of the truth
+    path.write_bytes(data)
+    recording = read(path, name="log")
+    assert len(recording.truth.stamp_ns) == 10
+    assert recording.damage == (
+        "damaged: its index cannot be used (the checksum of the index fails): "
+        "read from start to end, no message is lost"
+    )
+
+
+def test_hit_in_a_chunk_that_the_index_points_at(path):
+    write_recording(path, FRAMES, chunk_size=1, compression=CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    data[last_chunk_start(path) + 9 + 8 + 8 + 8 + 4 + 4 + 8 + 50] ^= 0x10  # inside the records of the chunk
+    path.write_bytes(data)
+    recording = read(path, name="log")
+    assert len(recording.truth.stamp_ns) == 9
+    assert recording.damage == (
+        "damaged after 0.800 s: 9 of 10 messages read (the checksum of a Chunk record fails)"
+    )
+
+
+def test_hit_in_the_only_chunk(path):
+    write_recording(path, FRAMES, compression=CompressionType.NONE)
+    data = bytearray(path.read_bytes())
+    data[last_chunk_start(path) + 200] ^= 0x10
+    path.write_bytes(data)
+    assert problem(path) == "damaged, and no message can be read (the checksum of a Chunk record fails)"
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_flipped_bit_anywhere_gives_a_recording_or_one_line(path, compression):
+    """500 files with one flipped bit each: no traceback, and no more messages than there were."""
+    frames = [(k / 10, [Obj(id=i, x=10.0 * k) for i in range(4)]) for k in range(12)]
+    write_recording(path, frames, chunk_size=400, compression=compression, host=2)
+    whole = path.read_bytes()
+    dice = random.Random(1)
+    for _ in range(500):
+        data = bytearray(whole)
+        data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+        path.write_bytes(data)
+        found = outcome(path)
+        if isinstance(found, Recording):
+            assert 1 <= len(found.truth.stamp_ns) <= 12
+        else:
+            assert len(found) == 1
+
+
+def test_cut_off_anywhere_gives_a_recording_or_one_line(path):
+    write_recording(path, FRAMES, chunk_size=1)
+    whole = path.read_bytes()
+    read_frames = []
+    for length in range(len(container.MAGIC), len(whole), 7):
+        path.write_bytes(whole[:length])
+        found = outcome(path)
+        if isinstance(found, Recording):
+            assert found.damage is not None
+            read_frames.append(len(found.truth.stamp_ns))
+        else:
+            assert found == (f"{path}: damaged, and no message can be read ({CUT_OFF})",)
+            read_frames.append(0)
+    assert read_frames == sorted(read_frames)  # the more is left, the more is read
+    assert set(read_frames) == set(range(11))
