@@ -18,9 +18,7 @@ LONGEST_M = 200.0  # nothing on a road is longer or wider (chosen)
 _X, _Y, _Z, _YAW, _VX, _VY, _LENGTH, _WIDTH, _HEIGHT = range(len(VALUES))
 
 
-def assemble(
-    columns: Columns, log: str
-) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
+def assemble(columns: Columns, log: str) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
     """Scene (without ego), truth and notes of the log named `log`. No scene where no object is usable."""
     notes: list[str] = []
     kept_list, stamp_ns = _in_order(columns, notes)
@@ -56,15 +54,11 @@ def _in_order(columns: Columns, notes: list[str]) -> tuple[Int, Int]:
             # Log times may run on another clock: one of 2026 in a simulation would be a gap of decades.
             stamped = stamp_ns[columns.stamped]
             slack_ns = 1_000_000_000  # chosen
-            use = columns.stamped | (
-                (stamp_ns >= stamped.min() - slack_ns) & (stamp_ns <= stamped.max() + slack_ns)
-            )
+            use = columns.stamped | ((stamp_ns >= stamped.min() - slack_ns) & (stamp_ns <= stamped.max() + slack_ns))
         if taken := int((use & ~columns.stamped).sum()):
             notes.append(f"{counted(taken, 'message')} without timestamp: the time of logging taken")
         if dropped := int((~use).sum()):
-            notes.append(
-                f"{counted(dropped, 'message')} without timestamp, and logged at another time: skipped"
-            )
+            notes.append(f"{counted(dropped, 'message')} without timestamp, and logged at another time: skipped")
     kept = np.flatnonzero(use)
     if late := int((np.diff(stamp_ns[kept]) < 0).sum()):
         notes.append(f"{counted(late, 'message')} stamped earlier than the one before: sorted by time")
@@ -85,9 +79,9 @@ def _usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
             "without a position, or with one that is no number": ~np.isfinite(place).all(axis=1),
             f"farther than {FARTHEST_M:g} m from the origin": (np.abs(place) > FARTHEST_M).any(axis=1),
             "whose yaw is no number": ~np.isfinite(values[:, _YAW]),
-            f"whose length or width is not between 0 and {LONGEST_M:g} m": ~(
-                (size > 0.0) & (size <= LONGEST_M)
-            ).all(axis=1),
+            f"whose length or width is not between 0 and {LONGEST_M:g} m": ~((size > 0.0) & (size <= LONGEST_M)).all(
+                axis=1
+            ),
         }
     for what, rows in defects.items():
         if number := int((usable & rows).sum()):
@@ -103,9 +97,7 @@ def _once_per_list(row: Int, frame: Int, object_ix: Int, notes: list[str]) -> In
     same = np.zeros(len(row), dtype=bool)
     same[by_object[1:]] = (np.diff(object_ix[row][by_object]) == 0) & (np.diff(frame[row][by_object]) == 0)
     if same.any():
-        notes.append(
-            f"{counted(int(same.sum()), 'object state')} of an id twice in a message: the first kept"
-        )
+        notes.append(f"{counted(int(same.sum()), 'object state')} of an id twice in a message: the first kept")
     return row[~same]
 
 
@@ -120,9 +112,7 @@ def _by_appearance(object_ix: Int) -> tuple[Int, Int]:
 
 def _most_frequent(object_ix: Int, class_ix: NDArray[np.int8], notes: list[str]) -> NDArray[np.int8]:
     """(N,) class of each object: the most frequent of its rows, of equally frequent ones the first."""
-    pairs, first, counts = np.unique(
-        object_ix * len(CLASSES) + class_ix, return_index=True, return_counts=True
-    )
+    pairs, first, counts = np.unique(object_ix * len(CLASSES) + class_ix, return_index=True, return_counts=True)
     owner, candidate = pairs // len(CLASSES), pairs % len(CLASSES)
     best_first = np.lexsort((first, -counts, owner))
     _, top = np.unique(owner[best_first], return_index=True)
@@ -132,9 +122,7 @@ def _most_frequent(object_ix: Int, class_ix: NDArray[np.int8], notes: list[str])
     return majority
 
 
-def _tracks(
-    scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, values: Float, notes: list[str]
-) -> Tracks:
+def _tracks(scene: Scene, stamp_ns: Int, frame: Int, object_ix: Int, values: Float, notes: list[str]) -> Tracks:
     """Build the truth: rows track by track, corrected."""
     number = len(scene.object_ids)
     start = np.concatenate([[0], np.cumsum(np.bincount(object_ix, minlength=number))])
@@ -142,13 +130,9 @@ def _tracks(
     moving, class_ix = scene.moving[object_ix], scene.object_class[object_ix].astype(np.int64)
     column: dict[str, Float] = dict(zip(VALUES, values.T, strict=True))
     x, y = column["x_m"], column["y_m"]
-    vx, vy, said = repair.velocities(
-        start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving
-    )
+    vx, vy, said = repair.velocities(start, captured_s[frame], x, y, column["vx_mps"], column["vy_mps"], moving)
     notes += said
-    z, height, said = repair.heights(
-        object_ix, class_ix, moving, column["z_m"], column["width_m"], column["height_m"]
-    )
+    z, height, said = repair.heights(object_ix, class_ix, moving, column["z_m"], column["width_m"], column["height_m"])
     notes += said
     column |= {
         "vx_mps": vx,

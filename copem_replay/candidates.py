@@ -13,7 +13,7 @@ from copem_replay.experiment import Experiment
 from copem_replay.pem.condition import applies
 from copem_replay.pem.look import Look
 from copem_replay.resample import at_instants, wrap
-from copem_replay.tracks import UNCERTAINTIES, VALUES, Float, Int, Scene, Tracks
+from copem_replay.tracks import VALUES, Float, Int, Scene, Tracks
 from copem_replay.units import (
     Poses,
     carrier,
@@ -160,7 +160,6 @@ def _joined(units: tuple[str, ...], pieces: list[Tracks]) -> Tracks:
         arrives_s=captured_s[None],
         valid=rows("valid").astype(bool),
         **{name: rows(name) for name in VALUES},
-        **dict.fromkeys(UNCERTAINTIES),
     )
 
 

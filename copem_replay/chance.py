@@ -199,4 +199,4 @@ def normal_quantile(u: float) -> float:
         den = den * r + 1.36929880922735805310e-1
         den = den * r + 5.99832206555887937690e-1
     value = num / (den * r + 1.0)
-    return -value if q < 0 else value
+    return float(-value) if q < 0 else float(value)

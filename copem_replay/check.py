@@ -60,10 +60,11 @@ def _configuration(source: Source, key: Key, configuration: dict[str, Any], unit
     chosen = configuration.get("units")
     if chosen == "all" and not units:
         yield source.at((*key, "units"), "all: the experiment has no units")
-    for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
+    named = chosen if isinstance(chosen, list) else []
+    for k, unit in enumerate(named):
         if isinstance(unit, str | int) and str(unit) not in units:
             yield source.at((*key, "units", k), _unknown("unit", unit, units))
-        elif unit in chosen[:k]:
+        elif unit in named[:k]:
             yield source.at((*key, "units", k), f"unit {unit!r} named twice")
     latency = configuration.get("latency_s")
     for unit in latency if isinstance(latency, dict) else ():

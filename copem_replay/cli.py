@@ -49,7 +49,7 @@ def info(
 
     from copem_replay.info import describe, survey
 
-    surveys = [_or_problem(lambda log=log: survey(log)) for log in logs]
+    surveys = [_or_problem(survey, log) for log in logs]
     good = [s for s in surveys if isinstance(s, dict)]
     if as_json:
         print(json.dumps(good, indent=1, ensure_ascii=False))
@@ -127,7 +127,9 @@ def schema() -> int:
 
     from copem_replay.experiment import Experiment
 
-    described = Experiment.model_json_schema(by_alias=True) | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    described = Experiment.model_json_schema(by_alias=True) | {
+        "$schema": "https://json-schema.org/draft/2020-12/schema"
+    }
     print(json.dumps(described, indent=1))
     return 0
 
@@ -174,9 +176,9 @@ def _with_progress(work: Callable[[Callable[[int, int], None] | None], Any]) -> 
         return work(lambda done, total: bar.update(task, completed=done, total=total))
 
 
-def _or_problem(work: Callable[[], Any]) -> Any:
+def _or_problem(work: Callable[[Path], Any], path: Path) -> Any:
     try:
-        return work()
+        return work(path)
     except CopemError as error:
         return error.problems
 
@@ -202,7 +204,7 @@ def _ended() -> int:
         print("interrupted: nothing was written", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone: `copem-replay info … | head`
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         return 0
     except Exception as error:
         if hasattr(error, "format_message"):  # typer's words on options and arguments

@@ -52,13 +52,13 @@ class Slot:
         self.name = name
         self.built_in = dict(built_in)
 
-    def __get_pydantic_core_schema__(
-        self, source: type[Any], handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(self, source: type[Any], handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         """Validation: find the class that `kind` names and let it validate the rest."""
         return core_schema.no_info_plain_validator_function(
             self.build,
-            serialization=core_schema.plain_serializer_function_ser_schema(lambda c: c.model_dump(mode="json", by_alias=True)),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda c: c.model_dump(mode="json", by_alias=True)
+            ),
         )
 
     def __get_pydantic_json_schema__(
@@ -109,7 +109,7 @@ class Slot:
 
 def _problem(message: str) -> PydanticCustomError:
     # The message is a constant to pydantic: braces of the text must not be read as fields.
-    return PydanticCustomError("component", "{message}", {"message": message})  # type: ignore[arg-type]
+    return PydanticCustomError("component", "{message}", {"message": message})
 
 
 __all__ = ["Component", "Count", "Frozen", "NotNegative", "Number", "Positive", "Share", "Slot"]

@@ -99,9 +99,7 @@ def open_log(path: Path) -> Log:
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
     if not path.is_file():
-        raise RecordingError(
-            f"{path}: expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}"
-        )
+        raise RecordingError(f"{path}: expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}")
     with open_file(path) as file:
         _check_magic(path, file)
         try:
@@ -115,9 +113,7 @@ def open_log(path: Path) -> Log:
     return from_start(path)
 
 
-def from_start(
-    path: Path, index_error: BaseException | None = None, promised: tuple[Channel, ...] = ()
-) -> Log:
+def from_start(path: Path, index_error: BaseException | None = None, promised: tuple[Channel, ...] = ()) -> Log:
     """Look at an MCAP file whose index is missing or wrong: from start to end, as far as it goes.
 
     `promised`: the channels as the index has them, where it could be read. Raises RecordingError where there
@@ -159,11 +155,7 @@ def _reason(error: BaseException) -> str:
         return f"the checksum of a {type(error.record).__name__} record fails"
     if isinstance(error, zstandard.ZstdError | RuntimeError):
         return f"a chunk cannot be decompressed: {error}"
-    return (
-        f"{error}"
-        if str(error) and not isinstance(error, KeyError)
-        else f"{type(error).__name__} {error}".strip()
-    )
+    return f"{error}" if str(error) and not isinstance(error, KeyError) else f"{type(error).__name__} {error}".strip()
 
 
 def _by_index(file: IO[bytes], topics: set[str]) -> Iterator[Message]:
@@ -207,9 +199,7 @@ def _check_magic(path: Path, file: IO[bytes]) -> None:
     if not start:
         raise RecordingError(f"{path}: the file is empty")
     if start.startswith(_LFS_POINTER):
-        raise RecordingError(
-            f"{path}: a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
-        )
+        raise RecordingError(f"{path}: a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)")
     if not start.startswith(MAGIC):
         raise RecordingError(f"{path}: expected an MCAP file, found one that starts with {start[:16]!r}")
     file.seek(0)

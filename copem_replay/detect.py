@@ -31,9 +31,7 @@ class Detections:
     first_unit_ix: Int
 
 
-def detect(
-    heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool, max_age_s: float
-) -> Detections:
+def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool, max_age_s: float) -> Detections:
     """First detection of every look, from the lists of all units heard (their arrival times are common to all runs).
 
     `max_age_s` counts from capture, on top of a list's own way to the receiver.

@@ -54,7 +54,9 @@ def load(path: Path) -> Source:
     except IsADirectoryError:
         raise ExperimentError(f"{path}: is a folder; expected an experiment file (YAML)") from None
     except UnicodeDecodeError as error:
-        raise ExperimentError(f"{path}: expected YAML text in UTF-8, found byte {error.object[error.start]:#x}") from None
+        raise ExperimentError(
+            f"{path}: expected YAML text in UTF-8, found byte {error.object[error.start]:#x}"
+        ) from None
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
     reader = YAML(typ="safe", pure=True)
@@ -123,7 +125,7 @@ def _problems(source: Source, error: ValidationError) -> Iterator[str]:
 
 
 def _file_key(data: Any, location: tuple[str | int, ...]) -> Key:
-    """pydantic's location without what is not in the file (names of alternatives, `[key]`)."""
+    """Pydantic's location without what is not in the file (names of alternatives, `[key]`)."""
     key: list[str | int] = []
     here = data
     for k, part in enumerate(location):
@@ -147,7 +149,7 @@ def _message(item: Any, key: Key) -> str:
         return "missing"
     if kind == "union_tag_invalid":
         return f"expected kind: one of {item['ctx']['expected_tags']}; found {item['ctx']['tag']!r}"
-    message = item["msg"].removeprefix("Value error, ")
+    message: str = item["msg"].removeprefix("Value error, ")
     if kind in ("value_error", "component"):
         return message
     message = message[0].lower() + message[1:].removesuffix(".")

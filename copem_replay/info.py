@@ -138,8 +138,7 @@ def _topic_lines(topics: Sequence[dict[str, Any]]) -> list[str]:
     """Tabulate the topics."""
     rows = [("topic", "schema", "encoding", "messages", "")]
     rows += [
-        (t["topic"], t["schema"] or "-", t["encoding"] or "-", str(t["messages"]), _ROLES[t["role"]])
-        for t in topics
+        (t["topic"], t["schema"] or "-", t["encoding"] or "-", str(t["messages"]), _ROLES[t["role"]]) for t in topics
     ]
     a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))
     table = [f"  {w:<{a}}  {x:<{b}}  {y:<{c}}  {z:>{d}}  {role}".rstrip() for w, x, y, z, role in rows]
@@ -161,8 +160,6 @@ def _truth_lines(truth: dict[str, Any]) -> list[str]:
         lines.append(f"  {kind}: {objects or 'none'}")
     if ego := truth["ego"]:
         size = " × ".join(f"{side:.2f}" for side in ego["size_m"])
-        lines.append(
-            f"  ego: {ego['id']} ({ego['class']}, {size} m), {ego['from_s']:.3f} – {ego['to_s']:.3f} s"
-        )
+        lines.append(f"  ego: {ego['id']} ({ego['class']}, {size} m), {ego['from_s']:.3f} – {ego['to_s']:.3f} s")
     lines += [f"  missing: {line}" for line in truth["missing"]]
     return lines + [f"  note: {line}" for line in truth["notes"]]

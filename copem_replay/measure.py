@@ -8,9 +8,11 @@ gap_at_detection_m: the same from box to box. Source: Piazzoni et al. 2022 (dist
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from copem_replay.detect import Detections
 from copem_replay.experiment import Experiment
@@ -18,6 +20,8 @@ from copem_replay.onset import ENDED_BY, Looks, Reference, reference_at
 from copem_replay.resample import states_at
 from copem_replay.tracks import CLASSES, Float, Int, Scene, Tracks
 from copem_replay.visibility import rectangles
+
+T = TypeVar("T", bound=np.generic)
 
 
 def table(
@@ -46,7 +50,7 @@ def _rows(
 ) -> pd.DataFrame:  # fmt: skip
     S, M = len(runs), len(found.object_ix)
 
-    def flat(values: Float) -> Float:
+    def flat(values: NDArray[T]) -> NDArray[T]:
         return np.broadcast_to(values, (S, M)).ravel()
 
     detection_s = flat(result.detection_s)
@@ -90,9 +94,7 @@ def _distances(
     pairs["object"], pairs["time"] = object_ix[known], time_s[known]
     unique, back = np.unique(pairs, return_inverse=True)
     ego = reference_at(scene, truth, experiment, unique["time"])
-    at, present = states_at(
-        truth, unique["object"], unique["time"], t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
-    )
+    at, present = states_at(truth, unique["object"], unique["time"], t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     distance = np.where(present & ego.present, np.hypot(at["x_m"] - ego.x_m, at["y_m"] - ego.y_m), np.nan)
     distance_m[known], gap_m[known] = distance[back], box_gap(at, ego, present & ego.present)[back]
     return distance_m, gap_m

@@ -69,7 +69,9 @@ def reference_at(scene: Scene, truth: Tracks, experiment: Experiment, time_s: Fl
     name = experiment.measure.distance_to
     if name == "ego":
         if scene.ego_ix < 0:
-            raise ExperimentError(f"{scene.log}: no ego to measure distances from; give `ego:` or `distance_to: <unit>`")
+            raise ExperimentError(
+                f"{scene.log}: no ego to measure distances from; give `ego:` or `distance_to: <unit>`"
+            )
         at, present = _state(scene, truth, scene.ego_ix, time_s, experiment.max_gap_s)
         return Reference(at["x_m"], at["y_m"], at["yaw_rad"], at["length_m"], at["width_m"], present)
     unit = experiment.units[name]
@@ -90,7 +92,9 @@ def reference_at(scene: Scene, truth: Tracks, experiment: Experiment, time_s: Fl
     )
 
 
-def _state(scene: Scene, truth: Tracks, object_ix: int, time_s: Float, max_gap_s: float) -> tuple[dict[str, Float], Bool]:
+def _state(
+    scene: Scene, truth: Tracks, object_ix: int, time_s: Float, max_gap_s: float
+) -> tuple[dict[str, Float], Bool]:
     return states_at(truth, np.full(len(time_s), object_ix), time_s, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
 
 

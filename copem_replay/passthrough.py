@@ -116,6 +116,4 @@ class Original:
 
 
 def _moved(message: Message, numbers: dict[int, int]) -> Message:
-    return Message(
-        numbers[message.channel_id], message.log_time, message.data, message.publish_time, message.sequence
-    )
+    return Message(numbers[message.channel_id], message.log_time, message.data, message.publish_time, message.sequence)

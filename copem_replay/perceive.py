@@ -6,7 +6,8 @@ Detection is decided first, then the error is sampled, as in the paper.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class _Draws:
     def __init__(self, dice: Dice, address: Address, runs: Int, valid: Bool, zero: bool) -> None:
         self._dice, self._address, self._runs, self._valid, self._zero = dice, address, runs, valid, zero
 
-    def normal(self, name: str, rows: Int) -> Float:
+    def normal(self, rows: Int, name: str) -> Float:
         if self._zero:
             return np.zeros((len(self._runs), len(rows)))
         return self._dice.normal(
@@ -64,11 +65,11 @@ class _Draws:
 
 def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws: _Draws) -> Tracks:
     S, P = seen.valid.shape
-    columns = {
+    columns: dict[str, Any] = {
         name: np.repeat(getattr(seen, name), S, axis=0)
         for name in ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
     }
-    spread = {
+    spread: dict[str, Any] = {
         name: np.zeros((1, P))
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
@@ -77,7 +78,7 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws:
             rows = np.flatnonzero((seen.row_unit_ix == k) & (found.couple_ix == c))
             if couple.error is None or not len(rows):
                 continue
-            errors = couple.error.perturb(found.look.take(rows), lambda name, rows=rows: draws.normal(name, rows))
+            errors = couple.error.perturb(found.look.take(rows), partial(draws.normal, rows))
             columns["x_m"][:, rows] += errors.east_m
             columns["y_m"][:, rows] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
@@ -93,8 +94,12 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws:
             if errors.speed_mps is not None:
                 speed = found.look.speed_mps[rows]
                 # Along the direction of travel; of the heading where the object stands.
-                east = np.where(speed > 0, seen.vx_mps[0, rows] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, rows]))
-                north = np.where(speed > 0, seen.vy_mps[0, rows] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, rows]))
+                east = np.where(
+                    speed > 0, seen.vx_mps[0, rows] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, rows])
+                )
+                north = np.where(
+                    speed > 0, seen.vy_mps[0, rows] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, rows])
+                )
                 columns["vx_mps"][:, rows] += errors.speed_mps * east
                 columns["vy_mps"][:, rows] += errors.speed_mps * north
                 spread["speed_var_m2ps2"][0, rows] = errors.speed_var_m2ps2

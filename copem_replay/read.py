@@ -38,9 +38,7 @@ class Recording:
     topic: str
     notes: tuple[str, ...]  # a line per kind of thing derived, corrected, skipped or ignored
     host_id: str | None
-    damage: str | None = (
-        None  # what is wrong with the file and how far it could be read; among the notes, too
-    )
+    damage: str | None = None  # what is wrong with the file and how far it could be read; among the notes, too
 
 
 def read(path: Path | str, *, name: str, ego: str | None = None, topic: str | None = None) -> Recording:
@@ -67,9 +65,7 @@ def read_log(log: Log, *, name: str, ego: str | None = None, topic: str | None =
         read_messages = sum(c.messages for c in log.channels if c.topic == topic)
         damage = _damage(log, topic, None)
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
-        raise RecordingError(
-            f"{log.path}: {topic}: no usable object in {counted(read_messages, 'message')}{why}"
-        )
+        raise RecordingError(f"{log.path}: {topic}: no usable object in {counted(read_messages, 'message')}{why}")
     host, said = _host(columns.hosts)
     ego_ix, more = _ego(log.path, scene, ego, host)
     damage = _damage(log, topic, scene.end_s)
@@ -122,9 +118,7 @@ def _ignored(log: Log, chosen: str, topics: dict[str, str]) -> list[str]:
     for channel in log.channels:
         if channel.messages and not is_truth(channel):
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
-    return notes + [
-        f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()
-    ]
+    return notes + [f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
 
 
 def _decode(log: Log, topic: str) -> Columns:

@@ -40,9 +40,7 @@ class Replay:
 def prepare(recording: Recording, experiment: Experiment) -> Replay:
     """Everything about a log that all runs and configurations share."""
     scene = recording.scene
-    truth = at_instants(
-        recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
-    )
+    truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     found = candidates(scene, truth, experiment)
     on = looks(scene, truth, found.static, experiment)
     return Replay(scene, truth, found, found.of_objects(on.object_ix), on)
@@ -87,9 +85,7 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Trac
     result = {}
     for name, configuration in experiment.configurations.items():
         posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
-        seen = (
-            perceive(replay.scene, replay.found, experiment, runs, states="expected") if posterior else sampled
-        )
+        seen = perceive(replay.scene, replay.found, experiment, runs, states="expected") if posterior else sampled
         heard = listen(seen, replay.truth, experiment, configuration)
         fused = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
         result[name] = draw_posterior(fused, replay.scene, experiment.seed, runs) if posterior else fused

@@ -8,6 +8,7 @@ Within 1 µs of a frame the recorded state itself is taken.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,11 +23,12 @@ def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) 
     counts = np.maximum(hi - lo, 0)
     track = np.repeat(np.arange(len(counts)), counts)
     frame = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(lo, counts)
-    columns, present = _interpolate(truth, track, stamps_ns[frame], max_gap_s)
+    states, present = _interpolate(truth, track, stamps_ns[frame], max_gap_s)
+    columns: dict[str, Any] = {name: column[None, present] for name, column in states.items()}
     track, frame = track[present], frame[present]
     lengths = np.bincount(track, minlength=len(counts))
     kept = lengths > 0
-    captured_s = (stamps_ns - t0_ns) * 1e-9
+    captured_s: Float = (stamps_ns - t0_ns) * np.float64(1e-9)
     return replace(
         truth,
         start=np.concatenate([[0], np.cumsum(lengths[kept])]),
@@ -38,7 +40,7 @@ def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) 
         frame_unit_ix=np.zeros(len(stamps_ns), dtype=np.int64),
         arrives_s=captured_s[None],
         valid=np.ones((1, len(frame)), dtype=bool),
-        **{name: column[None, present] for name, column in columns.items()},
+        **columns,
     )
 
 
@@ -67,11 +69,7 @@ def _interpolate(truth: Tracks, track: Int, stamp_ns: Int, max_gap_s: float) -> 
     origin, stretch = own_ns.min(), int(np.ptp(own_ns)) + 10 * SAME_INSTANT_NS
     axis = own_ns - origin + truth.track_ix * stretch
     first, last = _ends(truth)
-    present = (
-        (track >= 0)
-        & (stamp_ns >= first[track] - SAME_INSTANT_NS)
-        & (stamp_ns <= last[track] + SAME_INSTANT_NS)
-    )
+    present = (track >= 0) & (stamp_ns >= first[track] - SAME_INSTANT_NS) & (stamp_ns <= last[track] + SAME_INSTANT_NS)
     stamp_ns = np.clip(stamp_ns, first[track], last[track])
     wanted = stamp_ns - origin + track * stretch + SAME_INSTANT_NS
     before = np.searchsorted(axis, wanted, side="right") - 1

@@ -44,7 +44,9 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
     if not (folder / _MARK).exists():
         raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
     if not overwrite:
-        raise OutputError(f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder")
+        raise OutputError(
+            f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder"
+        )
 
 
 def write_results(

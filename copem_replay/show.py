@@ -146,7 +146,9 @@ def _fill(
         _covariance(out, ["world", part, "covariance"], beliefs[name], colour)
         _position_errors(out, replay, experiment, name, beliefs[name], shown, colour)
         _events(out, ["events", part], table[table["configuration"] == name])
-    title = f"## {scene.log}: run {run}\n\nSeed {experiment.seed}, visibility `{experiment.visibility}`. The views show "
+    title = (
+        f"## {scene.log}: run {run}\n\nSeed {experiment.seed}, visibility `{experiment.visibility}`. The views show "
+    )
     text = f"{title}this run, the table is over all runs and logs.\n\n{_markdown(summary)}"
     out.static(["summary"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
@@ -381,3 +383,137 @@ def _markdown(frame: pd.DataFrame) -> str:
     lines = [[name, *(cell(value) for value in frame[name])] for name in frame.columns]
     lines.insert(1, ["---"] + ["---:"] * len(frame))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+# How it is laid out ---------------------------------------------------------------------------------------------
+
+
+def _blueprint(
+    replay: Replay, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int]
+) -> tuple[rrb.Blueprint, str]:
+    """Views of truth and configurations over plots and words; and a digest of all that it depends on."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    scene = replay.scene
+    eye, target = _eye(replay, table, shown)
+    controls = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0, 0, 1))
+    views = [
+        rrb.Spatial3DView(
+            origin="world",
+            name=name,
+            contents=["+ world/truth/**", "+ world/static", "+ world/units/**", f"+ {_path('world', _part(name))}/**"],
+            eye_controls=controls,
+        )
+        for name in configurations[:SHOWN_CONFIGURATIONS]
+    ]
+    plots = [
+        rrb.Horizontal(
+            rrb.TimeSeriesView(
+                origin=_path("plots", "visible_share", scene.object_ids[k]),
+                name="Visible share",
+                axis_y=rrb.ScalarAxis(range=(-0.02, 1.02)),
+            ),
+            rrb.TimeSeriesView(origin=_path("plots", "position_error", scene.object_ids[k]), name="Position error [m]"),
+            name=f"{scene.object_ids[k]} {CLASSES[scene.object_class[k]]}",
+        )
+        for k in shown
+    ]
+    words = rrb.Tabs(
+        rrb.TextLogView(origin="events", name="Events"), rrb.TextDocumentView(origin="summary", name="Summary")
+    )
+    below = [rrb.Tabs(*plots, name="Objects"), words] if plots else [words]
+    onset_ns = int(_ns(table["onset_s"].min())) if len(table) else 0
+    end_ns = max(replay.scene.end_ns - replay.scene.t0_ns, onset_ns)
+    panel = rrb.TimePanel(
+        timeline=ELAPSED,
+        play_state="paused",
+        state="collapsed",
+        time_selection=rr.encodings.AbsoluteTimeRange(onset_ns, end_ns),
+    )
+    blueprint = rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Grid(*views, grid_columns=3 if len(views) in (3, 5, 6) else 2 if len(views) > 1 else 1),
+            rrb.Horizontal(*below, column_shares=[3, 2] if plots else None),
+            row_shares=[2, 1],
+        ),
+        panel,
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+    parts = (LAYOUT, configurations, [scene.object_ids[k] for k in shown], eye, target, onset_ns, end_ns)
+    return blueprint, _digest(repr(parts))
+
+
+def _eye(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """From behind and above, on the ego and the measured objects between the first onset and the last detection."""
+    truth, ego_ix = replay.truth, replay.scene.ego_ix
+    rows = np.isin(truth.row_object_ix, [*shown, ego_ix])
+    if len(table):
+        until_s = np.nanmax([table["onset_s"].max(), table["detection_s"].max()])
+        rows &= (truth.row_captured_s >= table["onset_s"].min() - 0.5) & (truth.row_captured_s <= until_s + 0.5)
+    rows = rows if rows.any() else np.ones(len(rows), dtype=bool)
+    place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
+    if not place.size:
+        return (-30.0, 0.0, 30.0), (0.0, 0.0, 0.0)
+    low, high = place.min(axis=1), place.max(axis=1)
+    middle = (low + high) / 2
+    away_m = float(np.clip(0.9 * np.hypot(*(high - low)[:2]), 20, 120))
+    ego = np.flatnonzero(rows & (truth.row_object_ix == ego_ix))
+    yaw = truth.yaw_rad[0, ego[0]] if len(ego) else np.pi / 2
+    eye = middle + away_m * np.array([-np.cos(yaw), -np.sin(yaw), 0.8])
+    return tuple(np.round(eye, 1).tolist()), tuple(np.round(middle, 1).tolist())
+
+
+# Small things ---------------------------------------------------------------------------------------------------
+
+
+def _part(configuration: str) -> str:
+    """A configuration's part of entity paths; not one that is taken."""
+    taken = configuration in _RESERVED or configuration.startswith("configuration ")
+    return f"configuration {configuration}" if taken else configuration
+
+
+def _path(*parts: str) -> str:
+    import rerun as rr
+
+    return rr.new_entity_path(list(parts))
+
+
+def _digest(*texts: str) -> str:
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
+
+
+def _labels(scene: Scene) -> pa.Array:
+    names = [f"{name} {CLASSES[k]}" for name, k in zip(scene.object_ids, scene.object_class, strict=True)]
+    return pa.array(names, pa.string())
+
+
+def _by_frame(tracks: Tracks, kept: Bool) -> tuple[Int, Int]:
+    """The kept rows list by list, and how many each list holds (F,)."""
+    order, _ = tracks.by_frame
+    rows = order[kept[order]]
+    return rows, np.bincount(tracks.frame_ix[rows], minlength=len(tracks.stamp_ns))
+
+
+def _ns(time_s: Any) -> Any:
+    return np.rint(np.asarray(time_s) * 1e9).astype(np.int64)
+
+
+def _elapsed_ns(tracks: Tracks) -> Int:
+    """(F,) when each list is available, since the log's start."""
+    elapsed: Int = _ns(tracks.arrives_s[0])
+    return elapsed
+
+
+def _f32(*columns: Float) -> np.ndarray:
+    """Columns (K,) side by side, as the viewer has them."""
+    return np.stack(columns, axis=-1).astype(np.float32)
+
+
+def _upright(yaw_rad: Float) -> np.ndarray:
+    """Quaternions xyzw (K, 4) of turns about the vertical."""
+    zero = np.zeros(len(yaw_rad))
+    return _f32(zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2))

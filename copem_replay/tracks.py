@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,7 +174,7 @@ class Tracks:
         if keep.all():
             return self
         rows = keep[self.track_ix]
-        columns = {
+        columns: dict[str, Any] = {
             name: None if (a := getattr(self, name)) is None else a[:, rows]
             for name in ("valid", *VALUES, *UNCERTAINTIES)
         }

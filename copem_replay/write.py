@@ -109,7 +109,7 @@ def atomic_mcap(path: Path, *, profile: str) -> Iterator[Writer]:
             writer = Writer(file, enable_data_crcs=True)
             writer.start(profile=profile, library="copem_replay")
             yield writer
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]
             file.flush()
             os.fsync(file.fileno())
         mask = os.umask(0)

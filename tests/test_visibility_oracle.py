@@ -156,9 +156,7 @@ def test_a_bridge_covers_from_above():
     # From above, over a deck one sees under as well: 6 − 3·10/8 = 2.25 up to 6 − 2·10/9 = 3.7778 is hidden.
     deck = (span(8.0, 9.0, -20.0, 20.0), 3.0, 4.0)
     hidden = (6.0 - 20.0 / 9.0) - 2.25
-    assert surface_share((0.0, 0.0, 6.0), (AHEAD, 0.0, 4.0), [deck]) == pytest.approx(
-        1 - hidden / 4, abs=1e-9
-    )
+    assert surface_share((0.0, 0.0, 6.0), (AHEAD, 0.0, 4.0), [deck]) == pytest.approx(1 - hidden / 4, abs=1e-9)
     # Seen from above, a body over the target's own footprint is left out whatever its height.
     over = (span(9.0, 13.0, -20.0, 20.0), 1.0, 4.0)
     assert surface_share((0.0, 0.0, 6.0), TARGET, [over]) == 1.0
@@ -199,7 +197,6 @@ def share_by_points(
     offsets = [math.remainder(math.atan2(y, x) - middle, 2.0 * math.pi) for x, y in corners]
     z = target[1] + (target[2] - target[1]) * (np.arange(heights) + 0.5) / heights
     fraction = (np.arange(steps) + 0.5) / steps
-    level = eye + (z[:, None] - eye) * fraction
     seen = 0
     for k in range(azimuths):
         azimuth = middle + min(offsets) + (max(offsets) - min(offsets)) * (k + 0.5) / azimuths
@@ -210,7 +207,7 @@ def share_by_points(
         hidden = np.zeros(heights, dtype=bool)
         for polygon, bottom, top in others:
             inside = shapely.contains_xy(shapely.Polygon(polygon), x, y)
-            part = level[:, inside]
+            part = eye + (z[:, None] - eye) * fraction[inside]
             hidden |= ((part >= bottom) & (part <= top)).any(axis=1)
         seen += int((~hidden).sum())
     return seen / (azimuths * heights)
@@ -230,7 +227,7 @@ def test_random_scenes(seed: int, height: float):
     assert not any(shape.intersects(shapely.Point(observer[:2])) for shape in shapes)
     assert np.linalg.norm(observer[:2]) <= 40.0
 
-    for number in range(12):
+    for number in range(0, 12, 2):
         target = prism(bodies[number])
         others = [prism(body) for k, body in enumerate(bodies) if k != number]
         # The deck of a bridge, which no body of the scene is.
@@ -251,6 +248,7 @@ def test_random_scenes(seed: int, height: float):
             if shapely.Polygon(other[0]).intersection(area).area <= 1e-9
             and not shapely.Polygon(other[0]).contains(shapely.Point(observer[:2]))
         ]
-        points = share_by_points(observer, target, counted, azimuths=25, heights=100, steps=2000)
-        # The same azimuths on both sides; what is left is the grain of the points.
+        points = share_by_points(observer, target, counted, azimuths=25, heights=100, steps=10_000)
+        # The same azimuths on both sides; what is left is the grain of the points: half a height, and corners
+        # cut by less than a step (a few mm), each of which would be a whole column.
         assert surface_share(observer, target, others, azimuths=25) == pytest.approx(points, abs=6e-3)

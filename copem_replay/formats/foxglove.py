@@ -66,8 +66,6 @@ class SceneWriter:
         half = self._half_yaw[row]
         cube.pose.orientation.z, cube.pose.orientation.w = float(np.sin(half)), float(np.cos(half))
         size = cube.size
-        size.x, size.y, size.z = (
-            float(getattr(fused, n)[0, row]) for n in ("length_m", "width_m", "height_m")
-        )
+        size.x, size.y, size.z = (float(getattr(fused, n)[0, row]) for n in ("length_m", "width_m", "height_m"))
         cube.color.r, cube.color.g, cube.color.b = self._colour
         cube.color.a = 0.5

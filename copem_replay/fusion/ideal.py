@@ -33,7 +33,7 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Tra
     ee, en, nn = _information(heard)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     _combine_position(
-        heard.valid, *_full(heard, "x_m", "y_m"), ee, en, nn, rows, start,
+        heard.valid, _per_run(heard, heard.x_m), _per_run(heard, heard.y_m), ee, en, nn, rows, start,
         out["x_m"], out["y_m"], out["cov_ee_m2"], out["cov_en_m2"], out["cov_nn_m2"],
     )  # fmt: skip
     for name, variance in (
@@ -73,7 +73,9 @@ def draw_posterior(expected: Tracks, scene: Scene, seed: int, runs: Int) -> Trac
     dice = Dice(seed, scene.log)
     z1 = dice.normal("ideal fusion 1", address, runs, expected.valid)
     z2 = dice.normal("ideal fusion 2", address, runs, expected.valid)
-    assert expected.cov_ee_m2 is not None and expected.cov_en_m2 is not None and expected.cov_nn_m2 is not None
+    assert expected.cov_ee_m2 is not None
+    assert expected.cov_en_m2 is not None
+    assert expected.cov_nn_m2 is not None
     l11 = np.sqrt(expected.cov_ee_m2)
     l21 = expected.cov_en_m2 / l11
     l22 = np.sqrt(np.maximum(expected.cov_nn_m2 - l21**2, 0.0))
@@ -112,22 +114,24 @@ def _information(heard: Tracks) -> tuple[Float, Float, Float]:
     return mean + difference * c2, difference * s2, mean - difference * c2
 
 
-def _full(heard: Tracks, *names: str) -> list[Float]:
+def _per_run(heard: Tracks, values: Float) -> Float:
     """Values with a row per run, as the kernels want them."""
-    return [np.broadcast_to(getattr(heard, name), heard.valid.shape) for name in names]
+    return values if len(values) == len(heard.valid) else np.repeat(values, len(heard.valid), axis=0)
 
 
 def _combine(heard: Tracks, values: Float, variance: str | None, rows: Int, start: Int) -> tuple[Float, Float]:
     """Inverse-variance mean (S, P) of one scalar over the contributions, and its variance."""
     given = getattr(heard, variance) if variance else None
     shape = (1, len(heard.frame_ix))
-    weight = np.ones(shape) if variance is None else 1 / np.maximum(
-        np.zeros(shape) if given is None else given, SMALLEST_VARIANCE
+    weight = (
+        np.ones(shape)
+        if variance is None
+        else 1 / np.maximum(np.zeros(shape) if given is None else given, SMALLEST_VARIANCE)
     )
     mean = np.full((len(heard.valid), len(start) - 1), np.nan)
     spread = np.full_like(mean, np.nan)
     _combine_scalar(
-        heard.valid, np.broadcast_to(values, heard.valid.shape), np.broadcast_to(weight, heard.valid.shape),
+        heard.valid, _per_run(heard, values), _per_run(heard, weight),
         rows, start, mean, spread,
     )  # fmt: skip
     if given is None:

@@ -1,4 +1,4 @@
-"""A PEM: ordered couples of a condition, a detection model and an error model; the first whose condition holds applies."""
+"""A PEM: ordered couples of a condition, a detection model and an error model; the first that applies is used."""
 
 from __future__ import annotations
 
