@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from copem_replay.colours import Rgb, configuration_colours
+from copem_replay.colours import TRUTH, Rgb, configuration_colours
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
 from copem_replay.replay import Replay
@@ -52,7 +52,7 @@ SMALLEST_VARIANCE_M2 = 1e-6
 
 _STANDING, _EGO = 100, 200  # class ids: moving objects have the index of their class
 _RESERVED = ("truth", "static", "units")
-_VRU, _VEHICLE, _OTHER, _EGO_RGB = (235, 120, 140), (135, 155, 185), (160, 160, 160), (245, 245, 245)
+_VRU, _VEHICLE, _OTHER, _EGO_RGB = (235, 120, 140), (180, 180, 190), (150, 150, 130), (250, 250, 250)
 
 
 def write_rrd(
@@ -145,7 +145,7 @@ def _fill(
         out.static(["world", part, "boxes"], style)
         _covariance(out, ["world", part, "covariance"], beliefs[name], colour)
         _position_errors(out, replay, experiment, name, beliefs[name], shown, colour)
-        _events(out, ["events", part], table[table["configuration"] == name])
+        _events(out, ["events", part], name, table[table["configuration"] == name])
     title = (
         f"## {scene.log}: run {run}\n\nSeed {experiment.seed}, visibility `{experiment.visibility}`. The views show "
     )
@@ -316,7 +316,7 @@ def _visible_shares(out: _Out, replay: Replay, experiment: Experiment, shown: Se
         newest[unit, known] = mine[at[known]]
     carriers = np.array([carrier(scene, unit) for unit in experiment.units.values()], dtype=np.int64)
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
-    styles = (("ego", own, _EGO_RGB, 3.0), ("any unit", np.ones_like(own), (0, 158, 115), 1.5))
+    styles = (("ego", own, _EGO_RGB, 3.0), ("any unit", np.ones_like(own), TRUTH, 1.5))
     for k in shown:
         share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
         rows = np.flatnonzero(tracks.row_object_ix == k)
@@ -347,11 +347,11 @@ def _position_errors(
         out.series(["plots", "position_error", replay.scene.object_ids[k], name], _elapsed_ns(fused), error, style)
 
 
-def _events(out: _Out, path: list[str], part: pd.DataFrame) -> None:
+def _events(out: _Out, path: list[str], name: str, part: pd.DataFrame) -> None:
     """Onset of each object, and how its look ended. `part`: the rows of one configuration."""
     import rerun as rr
 
-    who = part["object_id"].astype(str) + " " + part["object_class"].astype(str) + ": "
+    who = f"{name}: " + part["object_id"].astype(str) + " " + part["object_class"].astype(str) + " "
     seen, lost = part["detected"].to_numpy(dtype=bool), ~part["detected"].to_numpy(dtype=bool)
     at_start = np.where(part["onset_at_start"], ", already at its first frame", "")
     late = part["time_to_detection_s"]
@@ -360,10 +360,10 @@ def _events(out: _Out, path: list[str], part: pd.DataFrame) -> None:
     endings = {
         "object_left": "left undetected",
         "ego_left": "undetected when the ego left",
-        "log_end": "log ended, undetected",
+        "log_end": "undetected when the log ended",
     }
-    found = who + "detected by " + part["first_unit"].astype(str) + " " + when + far
-    text = pd.concat([who + "onset" + at_start, found[seen], (who + part["ended_by"].map(endings))[lost]])
+    found = who + "is detected by " + part["first_unit"].astype(str) + " " + when + far
+    text = pd.concat([who + "has its onset" + at_start, found[seen], (who + part["ended_by"].map(endings))[lost]])
     time_s = np.concatenate([part["onset_s"], part["detection_s"][seen], part["ended_s"][lost]]).astype(float)
     level = np.repeat(["INFO", "INFO", "WARN"], [len(part), seen.sum(), lost.sum()])
     order = np.argsort(time_s, kind="stable")
@@ -460,10 +460,10 @@ def _eye(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> tuple[tup
         return (-30.0, 0.0, 30.0), (0.0, 0.0, 0.0)
     low, high = place.min(axis=1), place.max(axis=1)
     middle = (low + high) / 2
-    away_m = float(np.clip(0.9 * np.hypot(*(high - low)[:2]), 20, 120))
+    away_m = float(np.clip(0.6 * np.hypot(*(high - low)[:2]), 15, 115))
     ego = np.flatnonzero(rows & (truth.row_object_ix == ego_ix))
     yaw = truth.yaw_rad[0, ego[0]] if len(ego) else np.pi / 2
-    eye = middle + away_m * np.array([-np.cos(yaw), -np.sin(yaw), 0.8])
+    eye = middle + away_m * np.array([-np.cos(yaw), -np.sin(yaw), 0.9])
     return tuple(np.round(eye, 1).tolist()), tuple(np.round(middle, 1).tolist())
 
 

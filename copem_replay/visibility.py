@@ -9,6 +9,7 @@ The integration is in visibility_kernel.py.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.tracks import Bool, Float, Int, Tracks
+from copem_replay.visibility_kernel import views
 
 _ROWS_PER_THREAD = 20_000
 """Below this many views a thread costs more than it brings (chosen)."""
@@ -65,7 +67,14 @@ NO_STATICS = Statics(
 
 
 def visible_shares(
-    world: Tracks, static: Statics, observer_m: Float, present: Bool, carrier_ix: Int, *, flat: bool, threads: int = 2
+    world: Tracks,
+    static: Statics,
+    observer_m: Float,
+    present: Bool,
+    carrier_ix: Int,
+    *,
+    flat: bool,
+    threads: int | None = None,
 ) -> Float:
     """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier.
 
@@ -74,9 +83,8 @@ def visible_shares(
     """
     order, bounds = world.by_frame
     n_units, n_frames = present.shape
-    shares = np.full((n_units, len(order)), np.nan)
     if not len(order):
-        return shares
+        return np.empty((n_units, 0))
     corners = box_corners(world)[order]
     z, height = world.z_m[0, order], world.height_m[0, order]
     arrays = (
@@ -84,23 +92,23 @@ def visible_shares(
         static.xy_m, static.start, static.body, static.bottom_m, static.top_m,
         np.ascontiguousarray(observer_m), np.ascontiguousarray(present), carrier_ix, flat,
     )  # fmt: skip
-    views = n_units * len(order)
-    pieces = max(1, min(4 * threads, views // _ROWS_PER_THREAD, n_frames))
+    threads = threads or min(8, os.cpu_count() or 1)
+    asked = n_units * len(order)
+    pieces = max(1, min(4 * threads, asked // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
     cuts = np.searchsorted(bounds, np.linspace(0, len(order), pieces + 1)[1:-1])
     edges = [0, *sorted(int(c) for c in cuts), n_frames]
     out = np.full((n_units, len(order)), np.nan)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(lambda k: views(edges[k], edges[k + 1], *arrays, out), range(pieces)))
+    shares = np.empty_like(out)
     shares[:, order] = out
     return shares
 
 
-def box_corners(tracks: Tracks, run: int = 0) -> Float:
-    """Corners of the boxes' footprints, counter-clockwise: (P, 4, 2)."""
-    row = [getattr(tracks, name)[min(run, getattr(tracks, name).shape[0] - 1)] for name in
-           ("x_m", "y_m", "yaw_rad", "length_m", "width_m")]  # fmt: skip
-    return rectangles(*row)
+def box_corners(tracks: Tracks) -> Float:
+    """Corners of the boxes' footprints in the first run, counter-clockwise: (P, 4, 2)."""
+    return rectangles(tracks.x_m[0], tracks.y_m[0], tracks.yaw_rad[0], tracks.length_m[0], tracks.width_m[0])
 
 
 def rectangles(x_m: Float, y_m: Float, yaw_rad: Float, length_m: Float, width_m: Float) -> Float:
