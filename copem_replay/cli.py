@@ -87,7 +87,7 @@ def run(
 ) -> int:
     """Replay, measure, write the results folder, print the summary."""
     from copem_replay.results import check_target, write_results
-    from copem_replay.table import as_text
+    from copem_replay.table import summary_text
 
     folder = out or Path("out") / experiment.stem
     check_target(folder, overwrite=overwrite)
@@ -100,7 +100,7 @@ def run(
     result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
     write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite)
     _say([f"{path}: skipped: {reason}" for path, reason in skipped] + list(result.notes))
-    print(as_text(result.summary))
+    print(summary_text(result.summary))
     print(f"results in {folder}")
     return 1 if skipped else 0
 

@@ -196,7 +196,7 @@ def _truth(out: _Out, scene: Scene, truth: Tracks, shown: Sequence[int]) -> None
     wireframe = rr.components.FillMode.MajorWireframe
     out.static(["world", "truth", "boxes"], rr.Boxes3D.from_fields(fill_mode=wireframe, radii=0.03, show_labels=False))
     rows, counts = _by_frame(truth, np.isin(truth.row_object_ix, shown))
-    above = _f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] + truth.height_m[0, rows] / 2 + 0.5)
+    above = _f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] + truth.height_m[0, rows] / 2 + 2)
     labels = _labels(scene).take(pa.array(truth.row_object_ix[rows]))
     names = rr.Points3D.columns(positions=above, labels=labels)
     out.columns(["world", "truth", "measured"], _elapsed_ns(truth), names, counts)
@@ -351,19 +351,21 @@ def _events(out: _Out, path: list[str], name: str, part: pd.DataFrame) -> None:
     """Onset of each object, and how its look ended. `part`: the rows of one configuration."""
     import rerun as rr
 
-    who = f"{name}: " + part["object_id"].astype(str) + " " + part["object_class"].astype(str) + " "
+    who = part["object_id"].astype(str) + " " + part["object_class"].astype(str)
     seen, lost = part["detected"].to_numpy(dtype=bool), ~part["detected"].to_numpy(dtype=bool)
     at_start = np.where(part["onset_at_start"], ", already at its first frame", "")
     late = part["time_to_detection_s"]
     when = late.abs().map("{:.2f} s ".format) + np.where(late < 0, "before", "after") + " the onset"
     far = part["distance_at_detection_m"].map(", at {:.1f} m".format).mask(part["distance_at_detection_m"].isna(), "")
     endings = {
-        "object_left": "left undetected",
-        "ego_left": "undetected when the ego left",
-        "log_end": "undetected when the log ended",
+        "object_left": " left undetected",
+        "ego_left": " undetected when the ego left",
+        "log_end": " undetected when the log ended",
     }
-    found = who + "is detected by " + part["first_unit"].astype(str) + " " + when + far
-    text = pd.concat([who + "has its onset" + at_start, found[seen], (who + part["ended_by"].map(endings))[lost]])
+    found = who + " detected by " + part["first_unit"].astype(str) + " " + when + far
+    text = f"{name}: " + pd.concat(
+        ["onset of " + who + at_start, found[seen], (who + part["ended_by"].map(endings))[lost]]
+    )
     time_s = np.concatenate([part["onset_s"], part["detection_s"][seen], part["ended_s"][lost]]).astype(float)
     level = np.repeat(["INFO", "INFO", "WARN"], [len(part), seen.sum(), lost.sum()])
     order = np.argsort(time_s, kind="stable")
@@ -404,6 +406,7 @@ def _blueprint(
             name=name,
             contents=["+ world/truth/**", "+ world/static", "+ world/units/**", f"+ {_path('world', _part(name))}/**"],
             eye_controls=controls,
+            line_grid=rrb.LineGrid3D(spacing=5.0),
         )
         for name in configurations[:SHOWN_CONFIGURATIONS]
     ]
@@ -419,8 +422,10 @@ def _blueprint(
         )
         for k in shown
     ]
+    kinds = [rrb.encodings.TextLogColumn(kind) for kind in ("LogLevel", "Body")]
     words = rrb.Tabs(
-        rrb.TextLogView(origin="events", name="Events"), rrb.TextDocumentView(origin="summary", name="Summary")
+        rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=kinds)),
+        rrb.TextDocumentView(origin="summary", name="Summary"),
     )
     below = [rrb.Tabs(*plots, name="Objects"), words] if plots else [words]
     onset_ns = int(_ns(table["onset_s"].min())) if len(table) else 0
@@ -428,6 +433,7 @@ def _blueprint(
     panel = rrb.TimePanel(
         timeline=ELAPSED,
         play_state="paused",
+        loop_mode="selection",
         state="collapsed",
         time_selection=rr.encodings.AbsoluteTimeRange(onset_ns, end_ns),
     )
@@ -460,7 +466,7 @@ def _eye(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> tuple[tup
         return (-30.0, 0.0, 30.0), (0.0, 0.0, 0.0)
     low, high = place.min(axis=1), place.max(axis=1)
     middle = (low + high) / 2
-    away_m = float(np.clip(0.6 * np.hypot(*(high - low)[:2]), 15, 115))
+    away_m = float(np.clip(0.6 * np.hypot(*(high - low)[:2]), 15, 120))
     ego = np.flatnonzero(rows & (truth.row_object_ix == ego_ix))
     yaw = truth.yaw_rad[0, ego[0]] if len(ego) else np.pi / 2
     eye = middle + away_m * np.array([-np.cos(yaw), -np.sin(yaw), 0.9])

@@ -203,7 +203,7 @@ def share_by_points(
         way = np.array([math.cos(azimuth), math.sin(azimuth)])
         ray = shapely.LineString([here, here + 500.0 * way])
         reach = shapely.Point(here).distance(ray.intersection(shape))
-        x, y = (here[:, None] + way[:, None] * reach * fraction).tolist()
+        x, y = here[:, None] + way[:, None] * reach * fraction
         hidden = np.zeros(heights, dtype=bool)
         for polygon, bottom, top in others:
             inside = shapely.contains_xy(shapely.Polygon(polygon), x, y)

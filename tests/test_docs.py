@@ -1,0 +1,82 @@
+"""The documentation is true: its commands run, its output is real, its experiments load, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from copem_replay import cli
+from copem_replay.experiment import Experiment
+from copem_replay.experiment_file import load, parse
+from copem_replay.pem.detection import DetectionModel
+from copem_replay.pem.look import Look
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
+
+
+def test_readme_shows_what_its_command_prints(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.findall(r"<!-- output: copem-replay (.*?) -->\n```text\n(.*?)```", text, re.DOTALL)
+    assert found
+    for command, expected in found:
+        words = shlex.split(command)
+        out = tmp_path / "results"
+        words[words.index("--out") + 1] = str(out)
+        monkeypatch.setattr("sys.argv", ["copem-replay", *words])
+        monkeypatch.chdir(ROOT)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 0
+        assert capsys.readouterr().out.replace(str(out), "out/tc016d") == expected
+
+
+def test_readme_experiment_loads(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"<!-- experiment -->\n```yaml\n(.*?)```", text, re.DOTALL)
+    assert blocks
+    for k, block in enumerate(blocks):
+        path = tmp_path / f"{k}.yaml"
+        path.write_text(block, encoding="utf-8")
+        experiment, problems = parse(load(path))
+        assert problems == []
+        assert isinstance(experiment, Experiment)
+
+
+def test_own_model_of_the_architecture_page_works() -> None:
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    namespace: dict[str, object] = {"__name__": "page"}
+    exec(code, namespace)
+    fading = namespace["Fading"]
+    assert isinstance(fading, type)
+    assert issubclass(fading, DetectionModel)
+    one = np.ones(1)
+    look = Look(one * 20, one, one, one, np.zeros(1, dtype=np.int8), one, one, one, one, one)
+    assert fading(kind="page:Fading", half_range_m=20.0).probability(look) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_within_the_project_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), target
+
+
+def test_architecture_names_every_file() -> None:
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    for path in (ROOT / "copem_replay").rglob("*.py"):
+        name = path.relative_to(ROOT / "copem_replay").as_posix()
+        folder = name.split("/")[0] + "/" if "/" in name else None
+        assert path.name == "__init__.py" or name in text or (folder and f"`{folder}`" in text), name
+
+
+def test_decisions_fit_on_a_page() -> None:
+    for path in (ROOT / "docs/decisions").glob("*.md"):
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 30, path.name
