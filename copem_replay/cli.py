@@ -98,8 +98,8 @@ def run(
     from copem_replay.run import run as run_experiment
 
     result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
-    write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite)
-    _say([f"{path}: skipped: {reason}" for path, reason in skipped] + list(result.notes))
+    notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite)
+    _say([f"{path}: skipped: {reason}" for path, reason in skipped] + notes)
     print(summary_text(result.summary))
     print(f"results in {folder}")
     return 1 if skipped else 0

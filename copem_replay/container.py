@@ -27,7 +27,7 @@ from copem_replay.errors import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
 _LFS_POINTER = b"version https://git-lfs"
-_RECORD_LIMIT_BYTES = 1 << 30  # a longer record is taken for damage (chosen)
+RECORD_LIMIT_BYTES = 1 << 30  # a longer record is taken for damage (chosen)
 _FOOTER_BYTES = 20  # summary_start, summary_offset_start, summary_crc
 DAMAGE = (
     McapError,
@@ -103,7 +103,7 @@ def open_log(path: Path) -> Log:
     with open_file(path) as file:
         _check_magic(path, file)
         try:
-            reader = SeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES)
+            reader = SeekingReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
             summary = reader.get_summary()
             if summary is not None and _index_is_sound(summary):
                 _check_summary(file)
@@ -160,7 +160,7 @@ def _reason(error: BaseException) -> str:
 
 def _by_index(file: IO[bytes], topics: set[str]) -> Iterator[Message]:
     """Messages in order of log time. Raises BrokenIndexError."""
-    reader = SeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES)
+    reader = SeekingReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
     try:
         for _, _, message in reader.iter_messages(topics=topics):
             yield message
@@ -181,7 +181,7 @@ class _Stream:
     def __iter__(self) -> Iterator[McapRecord]:
         self.file.seek(0)
         try:
-            reader = StreamReader(self.file, validate_crcs=True, record_size_limit=_RECORD_LIMIT_BYTES)
+            reader = StreamReader(self.file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
             for record in reader.records:
                 if isinstance(record, Schema):
                     self.schemas.setdefault(record.id, record.name)

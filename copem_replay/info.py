@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from copem_replay import container
-from copem_replay.container import Channel, Log
+from copem_replay.container import Channel
 from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
 from copem_replay.read import Recording, choose_topic, is_truth, moving_ids, read_log, truth_topics
@@ -28,43 +28,40 @@ _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"
 def survey(path: Path | str) -> dict[str, Any]:
     """Look at a recording: plain data that JSON can hold, the same for the same bytes.
 
-    `readable`: whether a list of true objects could be read; if not, `problems` has the reasons, and `topics`
-    what the file holds all the same. `truth` has an entry per topic that could be the truth: one, unless
-    there is a choice to make (then `problems` says so). A bad recording raises nothing.
+    `readable`: whether a list of true objects could be read; if not, `reason` says why in a line, and `topics` what
+    the file holds all the same. `truth` has an entry per topic that could be the truth: one, unless there is a
+    choice to make (then `choice` says so). A bad recording raises nothing.
     """
-    found: dict[str, Any] = {"recording": Path(path).name, "readable": False, "problems": []}
+    found: dict[str, Any] = {"recording": Path(path).name, "readable": False, "reason": None, "choice": None}
     found |= {"damage": None, "topics": [], "truth": []}  # damage: of the file, what is wrong with it
     try:
         log = container.open_log(Path(path))
     except RecordingError as error:
-        return found | {"problems": list(error.problems)}
+        return found | {"reason": str(error)}
     found |= {"damage": log.damage, "topics": [_topic(c) for c in log.channels]}
-    for topic in _candidates(log, found["problems"]):
+    try:
+        topics = [choose_topic(log)[0]]
+    except RecordingError as error:
+        topics = list(truth_topics(log))
+        found["choice" if topics else "reason"] = str(error)
+    failures = []
+    for topic in topics:
         try:
             found["truth"].append(_truth(read_log(log, name=Path(path).stem, topic=topic)))
         except RecordingError as error:
-            found["problems"].extend(error.problems)
+            failures.append(str(error))
+    if failures and not found["truth"]:
+        found["reason"] = "; ".join(failures)
     damage = next((t["damage"] for t in found["truth"] if t["damage"]), found["damage"])
     return found | {"readable": bool(found["truth"]), "damage": damage}
 
 
 def describe(survey: dict[str, Any]) -> list[str]:
-    """Say in lines of plain text what `survey` found. Why it found no truth is left to `problems`."""
+    """Say in lines of plain text what `survey` found. Why it found no truth is left to `reason`."""
     lines: list[str] = [survey["recording"], *_topic_lines(survey["topics"])]
     for truth in survey["truth"]:
         lines += _truth_lines(truth)
-    if survey["readable"]:
-        lines += survey["problems"]
-    return lines
-
-
-def _candidates(log: Log, problems: list[str]) -> list[str]:
-    """Topics to look into: the one that would be read, or all between which there is a choice."""
-    try:
-        return [choose_topic(log)[0]]
-    except RecordingError as error:
-        problems.extend(error.problems)
-        return list(truth_topics(log))
+    return lines + ([survey["choice"]] if survey["choice"] else [])
 
 
 def _topic(channel: Channel) -> dict[str, Any]:

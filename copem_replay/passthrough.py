@@ -7,16 +7,16 @@ sorted.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from copem_replay.container import DAMAGE, open_file, open_log
-
-_RECORD_LIMIT_BYTES = 1 << 30
+from copem_replay.container import DAMAGE, RECORD_LIMIT_BYTES, open_file, open_log
 
 
 class Catalogue:
@@ -43,51 +43,61 @@ class Catalogue:
 
 
 class Original:
-    """What is in a recording besides its messages, and its messages on demand."""
+    """What is in a recording besides its messages, and its messages on demand.
+
+    `damage` says that not all of it can be copied, None where all can. Raises RecordingError where nothing can be read.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._indexed = open_log(path).indexed
+        self.damage: str | None = None
         self.profile = ""
         self.metadata: dict[str, dict[str, str]] = {}
         self.channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
         self._attachments: list[Attachment] = []
-        if self._indexed:
-            self._look_up()
-        else:
-            self._messages = self._salvage()
+        self._salvaged: list[Message] | None = None
+        log = open_log(path)
+        if not log.indexed or not self._look_up():
+            self._salvage()
+            if not log.complete or log.indexed:
+                self.damage = f"{path}: damaged: its messages are copied as far as they can be read"
 
-    def _look_up(self) -> None:
-        with open_file(self._path) as file:
-            reader = SeekingReader(file, record_size_limit=_RECORD_LIMIT_BYTES)
-            self.profile = reader.get_header().profile
-            summary = reader.get_summary()
-            assert summary is not None  # indexed
-            self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
-            self.metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-            self._attachments = list(reader.iter_attachments())
+    def _look_up(self) -> bool:
+        """Whether the file can be copied through its index: all of it is read once, for only that tells."""
+        try:
+            with open_file(self._path) as file:
+                reader = _reader(file)
+                self.profile = reader.get_header().profile
+                summary = reader.get_summary()
+                self.metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+                self._attachments = list(reader.iter_attachments())
+                for _message in reader.iter_messages():
+                    pass
+        except DAMAGE:
+            return False
+        if summary is None:
+            return False
+        self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
+        return True
 
-    def _salvage(self) -> list[Message]:
-        messages: list[Message] = []
-        with open_file(self._path) as file:
-            try:
-                for record in StreamReader(file, record_size_limit=_RECORD_LIMIT_BYTES).records:
-                    if isinstance(record, Header):
-                        self.profile = record.profile
-                    elif isinstance(record, Schema):
-                        self._schemas.setdefault(record.id, record)
-                    elif isinstance(record, Channel):
-                        self.channels.setdefault(record.id, record)
-                    elif isinstance(record, Metadata):
-                        self.metadata.setdefault(record.name, dict(record.metadata))
-                    elif isinstance(record, Attachment):
-                        self._attachments.append(record)
-                    elif isinstance(record, Message):
-                        messages.append(record)
-            except DAMAGE:
-                pass  # as far as it goes; the reader of the truth has said so
-        return sorted(messages, key=lambda m: m.log_time)
+    def _salvage(self) -> None:
+        self._salvaged, self._attachments = [], []
+        with open_file(self._path) as file, suppress(*DAMAGE):
+            for record in StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES).records:
+                if isinstance(record, Header):
+                    self.profile = record.profile
+                elif isinstance(record, Schema):
+                    self._schemas.setdefault(record.id, record)
+                elif isinstance(record, Channel):
+                    self.channels.setdefault(record.id, record)
+                elif isinstance(record, Metadata):
+                    self.metadata.setdefault(record.name, dict(record.metadata))
+                elif isinstance(record, Attachment):
+                    self._attachments.append(record)
+                elif isinstance(record, Message):
+                    self._salvaged.append(record)
+        self._salvaged.sort(key=lambda m: m.log_time)
 
     def register(self, catalogue: Catalogue) -> dict[int, int]:
         """Schemas, channels and attachments put into the output. Returns the new number of each channel."""
@@ -104,15 +114,16 @@ class Original:
 
     def messages(self, numbers: dict[int, int]) -> Iterator[Message]:
         """All messages in order of log time, with the channel numbers of the output."""
-        if not self._indexed:
-            for message in self._messages:
-                if message.channel_id in numbers:
-                    yield _moved(message, numbers)
+        if self._salvaged is not None:
+            yield from (_moved(message, numbers) for message in self._salvaged)
             return
         with open_file(self._path) as file:
-            reader = SeekingReader(file, record_size_limit=_RECORD_LIMIT_BYTES)
-            for _schema, _channel, message in reader.iter_messages():
+            for _schema, _channel, message in _reader(file).iter_messages():
                 yield _moved(message, numbers)
+
+
+def _reader(file: IO[bytes]) -> SeekingReader:
+    return SeekingReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
 
 
 def _moved(message: Message, numbers: dict[int, int]) -> Message:

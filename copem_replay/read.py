@@ -53,14 +53,14 @@ def read(path: Path | str, *, name: str, ego: str | None = None, topic: str | No
 
 def read_log(log: Log, *, name: str, ego: str | None = None, topic: str | None = None) -> Recording:
     """Do the same with a log that was opened before."""
-    topic, notes = choose_topic(log, topic)
+    topic, ignored = choose_topic(log, topic)
     try:
         columns = _decode(log, topic)
     except container.BrokenIndexError as error:
         log = container.from_start(log.path, error.__cause__, log.channels)
         columns = _decode(log, topic)
     scene, truth, found = assemble(columns, name)
-    notes += [*columns.notes, *found]
+    notes = [*columns.notes, *found]
     if scene is None or truth is None:
         read_messages = sum(c.messages for c in log.channels if c.topic == topic)
         damage = _damage(log, topic, None)
@@ -69,7 +69,7 @@ def read_log(log: Log, *, name: str, ego: str | None = None, topic: str | None =
     host, said = _host(columns.hosts)
     ego_ix, more = _ego(log.path, scene, ego, host)
     damage = _damage(log, topic, scene.end_s)
-    notes = [*([damage] if damage else []), *notes, *said, *more]
+    notes = [*([damage] if damage else []), *ignored, *notes, *said, *more]
     return Recording(replace(scene, ego_ix=ego_ix), truth, log.path, topic, tuple(notes), host, damage)
 
 

@@ -48,7 +48,8 @@ def states_at(
     truth: Tracks, object_ix: Int, time_s: Float, *, t0_ns: int, max_gap_s: float
 ) -> tuple[dict[str, Float], Bool]:
     """States of objects `(K,)` at times `(K,)`: a column `(K,)` per value, and whether the object is there then."""
-    track_of = np.full(int(max(object_ix.max(initial=-1), truth.object_ix.max(initial=-1))) + 1, -1)
+    # One place more than there are objects: index −1, no truth id, has no track.
+    track_of = np.full(int(max(object_ix.max(initial=-1), truth.object_ix.max(initial=-1))) + 2, -1)
     track_of[truth.object_ix] = np.arange(len(truth.object_ix))
     track = track_of[object_ix]
     stamp_ns = t0_ns + np.rint(time_s * 1e9).astype(np.int64)

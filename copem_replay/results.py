@@ -57,8 +57,8 @@ def write_results(
     *,
     skipped: Sequence[tuple[Path, str]] = (),
     overwrite: bool = False,
-) -> None:
-    """Write the folder of the contract. Raises OutputError."""
+) -> list[str]:
+    """Write the folder of the contract. Returns what has to be said of it. Raises OutputError."""
     check_target(folder, overwrite=overwrite)
     folder = Path(os.path.abspath(folder))
     try:
@@ -68,32 +68,37 @@ def write_results(
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
         scratch.chmod(0o777 & ~_umask())
-        _fill(scratch, folder, experiment, recordings, result, skipped)
+        notes = _fill(scratch, folder, experiment, recordings, result, skipped)
         _replace(scratch, folder)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    return notes
 
 
 def _fill(
     scratch: Path, folder: Path, experiment: Experiment, recordings: Sequence[Recording], result: Result,
     skipped: Sequence[tuple[Path, str]],
-) -> None:  # fmt: skip
+) -> list[str]:  # fmt: skip
     data = experiment.as_written()
     data["logs"] = [os.path.relpath(recording.path.resolve(), folder.resolve()) for recording in recordings]
     (scratch / "experiment.yaml").write_text(dump(data), encoding="utf-8")
-    provenance = provenance_of(experiment, recordings, result, skipped)
-    (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     result.table.to_parquet(scratch / "detections.parquet", engine="pyarrow", index=False)
     write_csv(result.summary, scratch / "summary.csv")
-    logs = shown_logs(experiment, result)
-    for log in logs:
+    notes = list(result.notes)
+    for log in shown_logs(experiment, result):
         target = scratch / "replay" if len(recordings) == 1 else scratch / "replay" / log
-        _show(target, log, experiment, recordings, result)
+        said = _show(target, log, experiment, recordings, result)
+        notes += [said] if said else []
+    provenance = provenance_of(experiment, recordings, result, skipped, notes)
+    (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return notes
 
 
-def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> None:
+def _show(
+    target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result
+) -> str | None:
     from copem_replay.show import write_rrd
     from copem_replay.write import write_mcap
 
@@ -102,12 +107,17 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     replay = next(r for r in result.replays if r.scene.log == log)
     beliefs = believed(replay, experiment, number)
     rows = result.table[(result.table["log"] == log) & (result.table["run"] == number)]
-    write_mcap(Path(f"{target}.mcap"), log_path_of(recordings, log), replay.scene, beliefs)
+    said = write_mcap(Path(f"{target}.mcap"), log_path_of(recordings, log), replay.scene, beliefs)
     write_rrd(Path(f"{target}.rrd"), replay, experiment, beliefs, rows, result.summary, number)
+    return said
 
 
 def provenance_of(
-    experiment: Experiment, recordings: Sequence[Recording], result: Result, skipped: Sequence[tuple[Path, str]]
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    result: Result,
+    skipped: Sequence[tuple[Path, str]],
+    notes: Sequence[str],
 ) -> dict[str, object]:
     """What made these results: versions, logs, seed, metric parameters; no clock, no host."""
     return {
@@ -124,7 +134,7 @@ def provenance_of(
         "max_gap_s": experiment.max_gap_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
         "run_shown": {log: shown_run(experiment, result, log) for log in shown_logs(experiment, result)},
-        "notes": list(result.notes),
+        "notes": list(notes),
     }  # fmt: skip
 
 

@@ -49,6 +49,8 @@ LAYOUT = 1
 """Counts up when the blueprint changes: the viewer keeps one per application id and prefers what it has."""
 SMALLEST_VARIANCE_M2 = 1e-6
 """Positions known better than this have no ellipse (chosen: 2 mm would not be seen)."""
+AROUND_S = 0.5
+"""The first picture takes in this much before the onset and after the detection (chosen)."""
 
 _STANDING, _EGO = 100, 200  # class ids: moving objects have the index of their class
 _RESERVED = ("truth", "static", "units")
@@ -99,12 +101,14 @@ class _Out:
     rec: rr.RecordingStream
     t0_ns: int
 
-    def static(self, path: list[str], *what: Any) -> None:
+    def static(self, path: list[Any], *what: Any) -> None:
         """What holds at all times."""
-        self.rec.log(path, *what, static=True)
+        import rerun as rr
 
-    def columns(self, path: list[str], elapsed_ns: Int, columns: Any, counts: Int) -> None:
-        """At each instant (F,) as many of the instances as `counts` (F,) says; none clears what was there."""
+        self.rec.log(rr.new_entity_path(path), *what, static=True)
+
+    def columns(self, path: list[Any], elapsed_ns: Int, columns: Any) -> None:
+        """A row per instant (F,)."""
         import rerun as rr
 
         if len(elapsed_ns):
@@ -112,16 +116,7 @@ class _Out:
                 rr.TimeColumn(ELAPSED, duration=elapsed_ns.astype("timedelta64[ns]")),
                 rr.TimeColumn(TIME, timestamp=(self.t0_ns + elapsed_ns).astype("datetime64[ns]")),
             ]
-            self.rec.send_columns(rr.new_entity_path(path), times, columns.partition(counts))
-
-    def series(self, path: list[str], elapsed_ns: Int, values: Float, *style: Any) -> None:
-        """A number per instant (F,); an empty row where NaN begins breaks the line."""
-        import rerun as rr
-
-        known = ~np.isnan(values)
-        kept = known | np.append(False, known[:-1])[: len(known)]
-        self.columns(path, elapsed_ns[kept], rr.Scalars.columns(scalars=values[known]), known[kept].astype(np.int64))
-        self.static(path, *style)
+            self.rec.send_columns(rr.new_entity_path(path), times, columns)
 
 
 def _fill(
@@ -199,7 +194,7 @@ def _truth(out: _Out, scene: Scene, truth: Tracks, shown: Sequence[int]) -> None
     above = _f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] + truth.height_m[0, rows] / 2 + 2)
     labels = _labels(scene).take(pa.array(truth.row_object_ix[rows]))
     names = rr.Points3D.columns(positions=above, labels=labels)
-    out.columns(["world", "truth", "measured"], _elapsed_ns(truth), names, counts)
+    out.columns(["world", "truth", "measured"], _elapsed_ns(truth), names.partition(counts))
     small = rr.Points3D.from_fields(colors=[_VRU], radii=rr.Radius.ui_points(1.5), show_labels=True)
     out.static(["world", "truth", "measured"], small)
     out.static(["world", "truth", "paths"], _paths(truth, [*shown, scene.ego_ix]))
@@ -231,7 +226,7 @@ def _statics(out: _Out, static: Statics) -> None:
     corners = [_f32(*a.T, bottom), _f32(*b.T, bottom), _f32(*b.T, top), _f32(*a.T, top)]
     outward = _f32((b - a)[:, 1], -(b - a)[:, 0], np.zeros(len(a)))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    up = np.tile(np.float32([0, 0, 1]), (len(a), 1))
+    up = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(a), 1))
     walls = (4 * here[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
     fan = (here != static.start[part]) & (there != static.start[part])
     lid = 4 * len(a) + np.stack([static.start[part], here, there], axis=-1)[fan]
@@ -254,7 +249,7 @@ def _units(out: _Out, replay: Replay, experiment: Experiment) -> None:
             out.static(path, rr.Points3D.from_fields(positions=place[:1]))
         else:
             elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
-            out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]), there.astype(np.int64))
+            out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
         mark = rr.Radius.ui_points(4)
         out.static(path, rr.Points3D.from_fields(colors=[_EGO_RGB], radii=mark, labels=[name], show_labels=True))
 
@@ -272,7 +267,7 @@ def _boxes(out: _Out, path: list[str], scene: Scene, tracks: Tracks, class_ids: 
         class_ids=class_ids[object_ix],
         labels=_labels(scene).take(pa.array(object_ix)),
     )
-    out.columns(path, _elapsed_ns(tracks), columns, counts)
+    out.columns(path, _elapsed_ns(tracks), columns.partition(counts))
 
 
 def _covariance(out: _Out, path: list[str], tracks: Tracks, colour: Rgb) -> None:
@@ -294,7 +289,7 @@ def _covariance(out: _Out, path: list[str], tracks: Tracks, colour: Rgb) -> None
         ),
         quaternions=_upright(np.arctan2(b, (a - d) / 2)[rows] / 2),
     )
-    out.columns(path, _elapsed_ns(tracks), columns, counts)
+    out.columns(path, _elapsed_ns(tracks), columns.partition(counts))
     solid = rr.components.FillMode.Solid
     out.static(path, rr.Ellipsoids3D.from_fields(colors=[(*colour, 70)], fill_mode=solid))
 
@@ -326,7 +321,13 @@ def _visible_shares(out: _Out, replay: Replay, experiment: Experiment, shown: Se
                 # A unit without a list of the object says nothing about it: the best of the others counts.
                 best = np.fmax.reduce(share[newest[units]], axis=0)
                 lines = rr.SeriesLines(names=name, colors=colour, widths=width)
-                out.series(["plots", "visible_share", scene.object_ids[k], name], stamps - scene.t0_ns, best, lines)
+                path = ["plots", "visible_share", scene.object_ids[k], name]
+                known = ~np.isnan(best)
+                # An empty row breaks the line (NaN would, too, but no two recordings with NaN compare equal).
+                kept = known | np.append(False, known[:-1])
+                values = rr.Scalars.columns(scalars=best[known]).partition(known[kept].astype(np.int64))
+                out.columns(path, (stamps - scene.t0_ns)[kept], values)
+                out.static(path, lines)
 
 
 def _position_errors(
@@ -334,17 +335,19 @@ def _position_errors(
 ) -> None:
     import rerun as rr
 
-    style = rr.SeriesLines(names=name, colors=colour, widths=1.5)
+    # Points, as an error belongs to one list and to no time between two; no row where there is nothing to measure.
+    style = rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=2.5)
     for k in shown:
         rows = np.flatnonzero((fused.row_object_ix == k) & fused.valid[0])
         frames = fused.frame_ix[rows]
-        at, _ = states_at(
+        at, there = states_at(
             replay.truth, np.full(len(rows), k), fused.arrives_s[0, frames],
             t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s,
         )  # fmt: skip
-        error = np.full(len(fused.stamp_ns), np.nan)
-        error[frames] = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])
-        out.series(["plots", "position_error", replay.scene.object_ids[k], name], _elapsed_ns(fused), error, style)
+        error = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])[there]
+        path = ["plots", "position_error", replay.scene.object_ids[k], name]
+        out.columns(path, _elapsed_ns(fused)[frames[there]], rr.Scalars.columns(scalars=error))
+        out.static(path, style)
 
 
 def _events(out: _Out, path: list[str], name: str, part: pd.DataFrame) -> None:
@@ -370,7 +373,7 @@ def _events(out: _Out, path: list[str], name: str, part: pd.DataFrame) -> None:
     level = np.repeat(["INFO", "INFO", "WARN"], [len(part), seen.sum(), lost.sum()])
     order = np.argsort(time_s, kind="stable")
     columns = rr.TextLog.columns(text=text.to_numpy(dtype=object)[order].tolist(), level=level[order].tolist())
-    out.columns(path, _ns(time_s[order]), columns, np.ones(len(order), dtype=np.int64))
+    out.columns(path, _ns(time_s[order]), columns)
 
 
 def _markdown(frame: pd.DataFrame) -> str:
@@ -394,11 +397,10 @@ def _blueprint(
     replay: Replay, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int]
 ) -> tuple[rrb.Blueprint, str]:
     """Views of truth and configurations over plots and words; and a digest of all that it depends on."""
-    import rerun as rr
     import rerun.blueprint as rrb
 
     scene = replay.scene
-    eye, target = _eye(replay, table, shown)
+    eye, target = _eye(replay, table)
     controls = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0, 0, 1))
     views = [
         rrb.Spatial3DView(
@@ -435,7 +437,7 @@ def _blueprint(
         play_state="paused",
         loop_mode="selection",
         state="collapsed",
-        time_selection=rr.encodings.AbsoluteTimeRange(onset_ns, end_ns),
+        time_selection=rrb.components.AbsoluteTimeRange(onset_ns, end_ns),
     )
     blueprint = rrb.Blueprint(
         rrb.Vertical(
@@ -453,24 +455,25 @@ def _blueprint(
     return blueprint, _digest(repr(parts))
 
 
-def _eye(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """From behind and above, on the ego and the measured objects between the first onset and the last detection."""
-    truth, ego_ix = replay.truth, replay.scene.ego_ix
-    rows = np.isin(truth.row_object_ix, [*shown, ego_ix])
+def _eye(replay: Replay, table: pd.DataFrame) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Where from and where to: from behind the ego and above, on it and the first object, from its onset to detection."""
+    truth, scene = replay.truth, replay.scene
+    rows = np.zeros(len(truth.frame_ix), dtype=bool)
     if len(table):
-        until_s = np.nanmax([table["onset_s"].max(), table["detection_s"].max()])
-        rows &= (truth.row_captured_s >= table["onset_s"].min() - 0.5) & (truth.row_captured_s <= until_s + 0.5)
-    rows = rows if rows.any() else np.ones(len(rows), dtype=bool)
-    place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
-    if not place.size:
+        look = table[table["object_id"] == table["object_id"].iloc[int(np.argmin(table["onset_s"]))]]
+        onset_s = look["onset_s"].min()
+        until_s = max(onset_s, look["detection_s"].fillna(onset_s).max())
+        rows = np.isin(truth.row_object_ix, [scene.object_number[look["object_id"].iloc[0]], scene.ego_ix])
+        rows &= (truth.row_captured_s >= onset_s - AROUND_S) & (truth.row_captured_s <= until_s + AROUND_S)
+    rows = np.flatnonzero(rows if rows.any() else np.ones(len(rows), dtype=bool))
+    if not len(rows):
         return (-30.0, 0.0, 30.0), (0.0, 0.0, 0.0)
+    place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
     low, high = place.min(axis=1), place.max(axis=1)
-    middle = (low + high) / 2
-    away_m = float(np.clip(0.6 * np.hypot(*(high - low)[:2]), 15, 120))
-    ego = np.flatnonzero(rows & (truth.row_object_ix == ego_ix))
-    yaw = truth.yaw_rad[0, ego[0]] if len(ego) else np.pi / 2
-    eye = middle + away_m * np.array([-np.cos(yaw), -np.sin(yaw), 0.9])
-    return tuple(np.round(eye, 1).tolist()), tuple(np.round(middle, 1).tolist())
+    away_m = np.clip(0.65 * np.hypot(*(high - low)[:2]), 15, 120)
+    yaw = truth.yaw_rad[0, rows[truth.row_object_ix[rows] == scene.ego_ix]][:1].sum()  # 0, looking east, without an ego
+    eye = (low + high) / 2 + away_m * np.array([-np.cos(yaw), -np.sin(yaw), 0.9])
+    return tuple(np.round(eye, 1).tolist()), tuple(np.round((low + high) / 2, 1).tolist())
 
 
 # Small things ---------------------------------------------------------------------------------------------------

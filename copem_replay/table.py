@@ -17,7 +17,9 @@ def summary_text(summary: pd.DataFrame) -> str:
         lines.append(f"95 %: {summary['interval'].dropna().iloc[0]} interval over {over.iloc[0]}")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
-        lines.append(f"ttd_rmst_s: mean time to detection, never detected counting as {_cell(float(horizon.iloc[0]))} s")
+        lines.append(
+            f"ttd_rmst_s: mean time to detection, never detected counting as {_cell(float(horizon.iloc[0]))} s"
+        )
     return "\n".join(lines)
 
 

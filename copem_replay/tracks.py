@@ -128,7 +128,7 @@ class Tracks:
         for name, shape in expected.items():
             if (found := getattr(self, name).shape) != shape:
                 raise ValueError(f"Tracks.{name}: expected shape {shape}, found {found}")
-        if E and (self.start[0] != 0 or self.start[-1] != P or (np.diff(self.start) < 1).any()):
+        if self.start[0] != 0 or self.start[-1] != P or (np.diff(self.start) < 1).any():
             raise ValueError("Tracks.start: expected 0 … P, strictly increasing (no empty tracks)")
         runs = {1}
         for name in ("arrives_s", "valid", *VALUES, *UNCERTAINTIES):

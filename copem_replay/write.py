@@ -30,8 +30,10 @@ OSI_RECORD = "net.asam.osi.trace"
 OSI_CHANNEL = "net.asam.osi.trace.channel."
 
 
-def write_mcap(path: Path, source: Path, scene: Scene, beliefs: Mapping[str, Tracks]) -> None:
+def write_mcap(path: Path, source: Path, scene: Scene, beliefs: Mapping[str, Tracks]) -> str | None:
     """`source` with the fused lists of one run added: `beliefs[configuration]` has values (1, P).
+
+    Returns what has to be said when not all of a damaged `source` could be copied.
 
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
@@ -63,6 +65,7 @@ def write_mcap(path: Path, source: Path, scene: Scene, beliefs: Mapping[str, Tra
             writer.add_message(
                 message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
             )
+    return original.damage
 
 
 def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, Any]) -> Iterator[Message]:

@@ -198,9 +198,7 @@ def test_hit_in_a_chunk_that_the_index_points_at(path):
     path.write_bytes(data)
     recording = read(path, name="log")
     assert len(recording.truth.stamp_ns) == 9
-    assert recording.damage == (
-        "damaged after 0.800 s: 9 of 10 messages read (the checksum of a Chunk record fails)"
-    )
+    assert recording.damage == ("damaged after 0.800 s: 9 of 10 messages read (the checksum of a Chunk record fails)")
 
 
 def test_hit_in_the_only_chunk(path):

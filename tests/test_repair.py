@@ -134,18 +134,14 @@ def stand(rows):
 
 
 def test_plausible_heights_are_left_alone():
-    boxes, notes = stand(
-        [(0, "pedestrian", 0.9, 0.5, 1.8), (1, "car", 0.75, 1.8, 1.5), (2, "bus", 12, 2.5, 3.1)]
-    )
+    boxes, notes = stand([(0, "pedestrian", 0.9, 0.5, 1.8), (1, "car", 0.75, 1.8, 1.5), (2, "bus", 12, 2.5, 3.1)])
     assert boxes == [(0.9, 1.8), (0.75, 1.5), (12, 3.1)]
     assert notes == []
 
 
 def test_an_implausible_height_becomes_the_typical_one_and_the_bottom_stays():
     # A pedestrian 0.5 m high at 10 m stands on 9.75 m: 1.75 m high, its centre is at 10.625 m.
-    boxes, notes = stand(
-        [(0, "pedestrian", 10, 0.6, 0.5), (0, "pedestrian", 10, 0.6, 0.5), (1, "car", 1, 2, 0)]
-    )
+    boxes, notes = stand([(0, "pedestrian", 10, 0.6, 0.5), (0, "pedestrian", 10, 0.6, 0.5), (1, "car", 1, 2, 0)])
     assert boxes == [(10.625, 1.75), (10.625, 1.75), (1.75, 1.5)]
     assert notes == ["height implausible or missing: 1 pedestrian (1.75 m taken), 1 car (1.5 m taken)"]
 
@@ -179,8 +175,6 @@ def test_boxes_of_one_height_stand_on_one_plane_already():
 
 def test_height_equal_to_width_of_three_objects_is_an_exporters_defect():
     rows = [(k, "car", 1, 1.8 + k / 10, 1.8 + k / 10) for k in range(3)]
-    assert stand(rows)[1] == [
-        "the height of every moving object equals its width, a known defect of exporters"
-    ]
+    assert stand(rows)[1] == ["the height of every moving object equals its width, a known defect of exporters"]
     assert stand(rows[:2])[1] == []
     assert stand([*rows, (3, "car", 1, 1.8, 1.5)])[1] == []

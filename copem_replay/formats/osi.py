@@ -78,19 +78,19 @@ class Decoder:
         self._object_ix = array("q")
         self._class_ix = array("b")
         self._values = array("d")
-        self._notes: Counter[str] = Counter()  # note → count; "#" stands for the counted noun
+        self._notes: Counter[tuple[str, str]] = Counter()  # what is counted, and what is the matter with it
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int) -> None:
         """Take in a message of `schema`, one of `TRUTH_SCHEMAS`; what is none is skipped and noted."""
         try:
             message = self._message_of[schema].FromString(payload)
         except DecodeError:
-            self._notes["message|cannot be decoded: skipped"] += 1
+            self._notes["message", "cannot be decoded: skipped"] += 1
             return
         truth = message
         if schema == SENSOR_VIEW:
             if not message.HasField("global_ground_truth"):
-                self._notes["message|without global_ground_truth: skipped"] += 1
+                self._notes["message", "without global_ground_truth: skipped"] += 1
                 return
             truth = message.global_ground_truth
         stamped = next((m for m in (message, truth) if m.HasField("timestamp")), None)
@@ -99,7 +99,7 @@ class Decoder:
         else:
             seconds, nanos = divmod(log_time_ns, 1_000_000_000)
         if abs(seconds) > _LAST_SECOND:
-            self._notes["message|with an impossible time stamp: skipped"] += 1
+            self._notes["message", "with an impossible time stamp: skipped"] += 1
             return
         self._stamp_ns.append(seconds * 1_000_000_000 + nanos)
         self._stamped.append(stamped is not None)
@@ -122,7 +122,7 @@ class Decoder:
             class_ix=np.array(self._class_ix, dtype=np.int8),
             values=np.array(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
             hosts=tuple(self._hosts),
-            notes=tuple(_sentence(note, number) for note, number in self._notes.items()),
+            notes=tuple(f"{counted(number, noun)} {what}" for (noun, what), number in self._notes.items()),
         )
 
     def _add_host(self, message: Any, truth: Any) -> None:
@@ -140,7 +140,7 @@ class Decoder:
         for moving in objects:
             ident = moving.id.value
             if ident == 0 and not moving.HasField("id"):
-                notes["object state|without an id: skipped"] += 1
+                notes["object state", "without an id: skipped"] += 1
                 continue
             base = moving.base
             position, size, velocity = base.position, base.dimension, base.velocity
@@ -149,7 +149,7 @@ class Decoder:
             if x == 0.0 and y == 0.0 and not base.HasField("position"):
                 x = _NAN
             if yaw == 0.0 and not base.HasField("orientation"):
-                notes["object state|without orientation: yaw 0 taken"] += 1
+                notes["object state", "without orientation: yaw 0 taken"] += 1
             if vx == 0.0 and vy == 0.0 and not base.HasField("velocity"):
                 vx = vy = _NAN
             kind = moving.type
@@ -168,7 +168,7 @@ class Decoder:
         for stationary in objects:
             ident = stationary.id.value
             if ident == 0 and not stationary.HasField("id"):
-                notes["object state|without an id: skipped"] += 1
+                notes["object state", "without an id: skipped"] += 1
                 continue
             base = stationary.base
             position, size, yaw = base.position, base.dimension, base.orientation.yaw
@@ -176,7 +176,7 @@ class Decoder:
             if x == 0.0 and y == 0.0 and not base.HasField("position"):
                 x = _NAN
             if yaw == 0.0 and not base.HasField("orientation"):
-                notes["object state|without orientation: yaw 0 taken"] += 1
+                notes["object state", "without orientation: yaw 0 taken"] += 1
             number = number_of.get(ident)
             self._object_ix.append(self._next_number(number_of, ident) if number is None else number)
             self._class_ix.append(OTHER)
@@ -196,8 +196,3 @@ class Decoder:
         for ident, number in self._stationary_number.items():
             ids[number] = f"stationary:{ident}" if ident in self._moving_number else str(ident)
         return tuple(ids), moving
-
-
-def _sentence(note: str, number: int) -> str:
-    noun, rest = note.split("|")
-    return f"{counted(number, noun)} {rest}"

@@ -53,7 +53,8 @@ class Gaussian(ErrorModel):
         """Offsets = mean + L·z with L·Lᵀ the covariance, turned into easting and northing."""
         (a, b), (_, d) = self.covariance_m2
         l11 = np.sqrt(a)
-        l21 = b / l11 if l11 > 0 else 0.0
+        # What rounding leaves of a singular matrix may not be blown up: no row is longer than its variance says.
+        l21 = float(np.clip(b / l11, -np.sqrt(d), np.sqrt(d))) if l11 > 0 else 0.0
         l22 = np.sqrt(max(d - l21 * l21, 0.0))
         z1, z2 = noise("position 1"), noise("position 2")
         first = self.mean_m[0] + l11 * z1

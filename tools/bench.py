@@ -1,0 +1,220 @@
+"""Benchmarks, one JSON line each. Ratios are taken within one run: trust them, not the absolute figures.
+
+    python tools/bench.py [name …]
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.check import problems, read_logs
+from copem_replay.experiment_file import load, log_paths
+from copem_replay.read import read
+from copem_replay.replay import believed, prepare, replay_block
+from copem_replay.tracks import TRUTH, Tracks
+from copem_replay.visibility import NO_STATICS, visible_shares
+
+ROOT = Path(__file__).parents[1]
+
+
+def main(names: list[str]) -> None:
+    for bench in BENCHES:
+        if not names or bench.__name__ in names:
+            for line in bench():
+                print(json.dumps(line), flush=True)
+
+
+def best(work: Callable[[], object], times: int = 5) -> float:
+    """Seconds of the fastest of several calls, after one that compiles and warms up."""
+    work()
+    return min(_seconds(work) for _ in range(times))
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def boxes(frames: int, count: int) -> Tracks:
+    """Boxes on random straight ways in a disc of 60 m: 60 % cars, 15 % trucks, 25 % pedestrians (chosen)."""
+    rng = np.random.default_rng(0)
+    kind = rng.choice(3, count, p=[0.6, 0.15, 0.25])
+    length, width, height = (np.array(v)[kind] for v in ((4.5, 10, 0.5), (1.9, 2.5, 0.5), (1.5, 3.5, 1.8)))
+    radius, angle = 60 * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, count)
+    heading, t = rng.uniform(-np.pi, np.pi, count), np.arange(frames) * 0.05
+    x = (radius * np.cos(angle))[:, None] + np.cos(heading)[:, None] * t * 0.5
+    y = (radius * np.sin(angle))[:, None] + np.sin(heading)[:, None] * t * 0.5
+
+    def rows(values: np.ndarray) -> np.ndarray:
+        return np.repeat(values, frames)[None]
+
+    zero = np.zeros((1, count * frames))
+    return Tracks(
+        units=(TRUTH,), start=np.arange(count + 1) * frames, unit_ix=np.zeros(count, dtype=int),
+        object_ix=np.arange(count), frame_ix=np.tile(np.arange(frames), count),
+        stamp_ns=np.rint(t * 1e9).astype(np.int64), captured_s=t, frame_unit_ix=np.zeros(frames, dtype=int),
+        arrives_s=t[None], valid=np.ones((1, count * frames), dtype=bool), x_m=x.reshape(1, -1), y_m=y.reshape(1, -1),
+        z_m=rows(height) / 2, yaw_rad=rows(heading), vx_mps=zero, vy_mps=zero, length_m=rows(length),
+        width_m=rows(width), height_m=rows(height),
+    )  # fmt: skip
+
+
+def visibility() -> Iterator[dict[str, object]]:
+    """Views per second at 1200 lists × 60 boxes × 21 units."""
+    frames, count, units = 1200, 60, 21
+    world, rng = boxes(frames, count), np.random.default_rng(1)
+    place = np.empty((units, frames, 3))
+    place[..., :2] = rng.uniform(-60, 60, (units, 1, 2))
+    place[..., 2] = rng.choice([1.8, 5.0], (units, 1))
+    present, carriers = np.ones((units, frames), dtype=bool), np.full(units, -1)
+    for kind in ("flat", "surface"):
+        seconds = best(
+            lambda kind=kind: visible_shares(world, NO_STATICS, place, present, carriers, flat=kind == "flat"), 3
+        )
+        yield {f"visibility_{kind}_views_per_s": round(units * frames * count / seconds)}
+
+
+def paper() -> Iterator[dict[str, object]]:
+    """The six configurations × 500 runs of the sample scenario, against NumPy drawing as many uniforms × 3."""
+    experiment, recordings = _loaded(ROOT / "logs/tc016d.yaml")
+    ready, runs = prepare(recordings[0], experiment), np.arange(experiment.runs)
+    rng = np.random.default_rng(1)
+    cells = len(ready.measured.tracks.frame_ix) * experiment.runs
+    ours = best(lambda: replay_block(ready, experiment, runs))
+    theirs = best(lambda: rng.random(3 * cells))
+    yield {
+        "paper_draw_ratio": round(ours / theirs, 2),
+        "seconds": round(ours, 4),
+        "runs_per_s": round(experiment.runs * len(experiment.configurations) / ours),
+    }
+
+
+def reading() -> Iterator[dict[str, object]]:
+    """Reading 60 s × 20 Hz × 60 objects, against parsing the messages and touching the same fields in a plain loop."""
+    with _scratch() as folder:
+        path = folder / "read.mcap"
+        _write_truth(path, boxes(1200, 60))
+        ours = best(lambda: read(path, name="read"), 3)
+        plain = best(lambda: _plain_loop(path), 3)
+    yield {"read_ratio": round(ours / plain, 3), "read_objects_per_s": round(72_000 / ours)}
+
+
+def writing() -> Iterator[dict[str, object]]:
+    """Objects per second into MCAP (lists and scenes) and boxes per second and bytes per box into .rrd."""
+    from copem_replay.show import write_rrd
+    from copem_replay.summary import horizon_s, summary
+    from copem_replay.write import write_mcap
+
+    experiment, recordings = _loaded(ROOT / "logs/tc016d.yaml")
+    ready = prepare(recordings[0], experiment)
+    beliefs = believed(ready, experiment, 0)
+    table = replay_block(ready, experiment, np.arange(1))
+    rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
+    rows, _ = summary(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
+    listed = sum(int(fused.valid.sum()) for fused in beliefs.values())
+    shown = listed + len(ready.truth.frame_ix)
+    with _scratch() as folder:
+        mcap, rrd = folder / "w.mcap", folder / "w.rrd"
+        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, beliefs), 3)
+        yield {"mcap_objects_per_s": round(listed / seconds)}
+        seconds = best(lambda: write_rrd(rrd, ready, experiment, beliefs, table, rows, 0), 3)
+        yield {
+            "rrd_boxes_per_s": round(shown / seconds),
+            "rrd_bytes_per_box": round(rrd.stat().st_size / shown, 1),
+            "boxes": shown,
+        }
+
+
+def commands() -> Iterator[dict[str, object]]:
+    """Seconds of `--help` and `info`, seconds and peak memory of what `make demo` runs."""
+    tool = [sys.executable, "-m", "copem_replay.cli"]
+    for name, words in (("help", ["--help"]), ("info", ["info", str(ROOT / "logs/tc016d.mcap")])):
+        seconds = best(lambda words=words: subprocess.run([*tool, *words], check=True, stdout=subprocess.DEVNULL), 3)
+        yield {f"{name}_s": round(seconds, 3)}
+    with _scratch() as folder:
+        words = ["run", str(ROOT / "logs/tc016d.yaml"), "--overwrite", "--out", str(folder / "out")]
+        code = (
+            "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL);"
+            "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+        )
+        command = [sys.executable, "-c", code, *tool, *words]
+        seconds = best(lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 2)
+        peak_kib = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        yield {"demo_s": round(seconds, 2), "demo_peak_mb": round(peak_kib / 1024)}
+
+
+def _loaded(path: Path):  # noqa: ANN202
+    source = load(path)
+    experiment, found = problems(source)
+    assert experiment is not None, found
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source)
+    assert not refused, refused
+    return experiment, recordings
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def _write_truth(path: Path, world: Tracks) -> None:
+    from mcap_protobuf.writer import Writer
+    from osi3.osi_groundtruth_pb2 import GroundTruth
+
+    order, bounds = world.by_frame
+    columns = [getattr(world, n)[0] for n in ("x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")]
+    with path.open("wb") as file, Writer(file) as writer:
+        for f, stamp in enumerate(world.stamp_ns.tolist()):
+            truth = GroundTruth()
+            truth.timestamp.seconds, truth.timestamp.nanos = divmod(stamp, 10**9)
+            truth.host_vehicle_id.value = 0
+            for r in order[bounds[f] : bounds[f + 1]].tolist():
+                item = truth.moving_object.add()
+                item.id.value, item.type = int(world.row_object_ix[r]), 2
+                item.vehicle_classification.type = 4
+                base = item.base
+                x, y, z, yaw, length, width, height = (float(c[r]) for c in columns)
+                base.position.x, base.position.y, base.position.z = x, y, z
+                base.orientation.yaw = yaw
+                base.velocity.x, base.velocity.y = 1.0, 0.5
+                base.dimension.length, base.dimension.width, base.dimension.height = length, width, height
+            writer.write_message("truth", truth, log_time=stamp, publish_time=stamp)
+
+
+def _plain_loop(path: Path) -> int:
+    """What a script would do: parse every message, touch every field that `read` needs, keep the numbers."""
+    from mcap.reader import make_reader
+    from osi3.osi_groundtruth_pb2 import GroundTruth
+
+    rows = []
+    with path.open("rb") as file:
+        for _schema, _channel, message in make_reader(file).iter_messages():
+            truth = GroundTruth.FromString(message.data)
+            t = truth.timestamp.seconds * 10**9 + truth.timestamp.nanos
+            for item in truth.moving_object:
+                base = item.base
+                rows.append(
+                    (t, item.id.value, item.type, item.vehicle_classification.type,
+                     base.position.x, base.position.y, base.position.z, base.orientation.yaw,
+                     base.velocity.x, base.velocity.y,
+                     base.dimension.length, base.dimension.width, base.dimension.height)
+                )  # fmt: skip
+    return len(pd.DataFrame(rows))
+
+
+BENCHES = (visibility, paper, reading, writing, commands)
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
