@@ -6,7 +6,7 @@ sorted.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
@@ -61,7 +61,7 @@ class Original:
         if not log.indexed or not self._look_up():
             self._salvage()
             if not log.complete or log.indexed:
-                self.damage = f"{path}: damaged: its messages are copied as far as they can be read"
+                self.damage = "damaged: its messages are copied as far as they can be read"
 
     def _look_up(self) -> bool:
         """Whether the file can be copied through its index: all of it is read once, for only that tells."""
@@ -99,10 +99,15 @@ class Original:
                     self._salvaged.append(record)
         self._salvaged.sort(key=lambda m: m.log_time)
 
-    def register(self, catalogue: Catalogue) -> dict[int, int]:
-        """Schemas, channels and attachments put into the output. Returns the new number of each channel."""
+    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
+        """Schemas, channels and attachments put into the output. Returns the new number of each channel.
+
+        Channels of the topics `without` are left out, with their messages.
+        """
         numbers: dict[int, int] = {}
         for number, channel in sorted(self.channels.items()):
+            if channel.topic in without:
+                continue
             schema = self._schemas.get(channel.schema_id)
             schema_id = catalogue.schema(schema.name, schema.encoding, schema.data) if schema else 0
             numbers[number] = catalogue.channel(
@@ -115,11 +120,12 @@ class Original:
     def messages(self, numbers: dict[int, int]) -> Iterator[Message]:
         """All messages in order of log time, with the channel numbers of the output."""
         if self._salvaged is not None:
-            yield from (_moved(message, numbers) for message in self._salvaged)
+            yield from (_moved(m, numbers) for m in self._salvaged if m.channel_id in numbers)
             return
         with open_file(self._path) as file:
             for _schema, _channel, message in _reader(file).iter_messages():
-                yield _moved(message, numbers)
+                if message.channel_id in numbers:
+                    yield _moved(message, numbers)
 
 
 def _reader(file: IO[bytes]) -> SeekingReader:

@@ -4,7 +4,7 @@ function of it, so that blocks can be computed anywhere, in any order, by any nu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ import pandas as pd
 from copem_replay.candidates import Candidates, candidates
 from copem_replay.detect import Detections, detect
 from copem_replay.experiment import Configuration, Experiment
-from copem_replay.fusion.ideal import draw_posterior, fuse
+from copem_replay.fusion.ideal import Belief, draw_posterior, fuse
 from copem_replay.fusion.inbox import inbox
 from copem_replay.measure import table
 from copem_replay.onset import Looks, looks
@@ -77,7 +77,7 @@ def listen(seen: Tracks, truth: Tracks, experiment: Experiment, configuration: C
     return transmit(seen.take_units(experiment.units_of(configuration)), configuration.latency_of)
 
 
-def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Tracks]:
+def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
     """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
     runs = np.array([run])
     ego = replay.scene.ego_ix
@@ -87,8 +87,11 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Trac
         posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
         seen = perceive(replay.scene, replay.found, experiment, runs, states="expected") if posterior else sampled
         heard = listen(seen, replay.truth, experiment, configuration)
-        fused = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
-        result[name] = draw_posterior(fused, replay.scene, experiment.seed, runs) if posterior else fused
+        belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
+        if configuration.units != TRUTH:
+            mine = np.isin(replay.found.tracks.row_unit_ix, [seen.units.index(unit) for unit in heard.units])
+            belief = replace(belief, look=replay.found.look.take(np.flatnonzero(mine)))
+        result[name] = draw_posterior(belief, replay.scene, experiment.seed, runs) if posterior else belief
     return result
 
 

@@ -210,14 +210,16 @@ def _faces(polygon: Float, size: int, ux: float, uy: float) -> tuple[bool, float
         ex, ey = polygon[m, 0] - ax, polygon[m, 1] - ay
         offset = ey * ax - ex * ay  # outward normal (ey, −ex) times a point of the edge
         speed = ey * ux - ex * uy
+        # Zero where the observer stands in line with the edge: then it is not the face that is seen.
+        nearness = 1.0 / offset if offset != 0.0 else 0.0
         if speed < 0.0:
             d = offset / speed
             if d > enter:
-                enter, nx, ny = d, ey / offset, -ex / offset
+                enter, nx, ny = d, ey * nearness, -ex * nearness
         elif speed > 0.0:
             d = offset / speed
             if d < leave:
-                leave, fx, fy = d, ey / offset, -ex / offset
+                leave, fx, fy = d, ey * nearness, -ex * nearness
         elif offset < 0.0:
             hit = False
     return hit and enter < leave and leave > 0.0, enter, nx, ny, fx, fy

@@ -98,9 +98,7 @@ def test_every_part_of_the_address_matters() -> None:
 def test_bernoulli_is_the_uniform_below_p_and_where_only_spares_work() -> None:
     dice, runs = Dice(1, "log"), np.arange(5)
     p = np.linspace(0, 1, ROWS)
-    np.testing.assert_array_equal(
-        dice.bernoulli("p", address(), runs, p), dice.uniform("p", address(), runs) < p
-    )
+    np.testing.assert_array_equal(dice.bernoulli("p", address(), runs, p), dice.uniform("p", address(), runs) < p)
     where = dice.bernoulli("p", address(), runs, p)
     full = dice.normal("e", address(), runs)
     np.testing.assert_array_equal(dice.normal("e", address(), runs, where), np.where(where, full, 0.0))
@@ -150,9 +148,7 @@ def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
         part = replay_block(ready, plan(), np.array(cut))
         expected = rows_of(whole, run=cut)
         keys = ["configuration", "run", "object_id"]
-        assert part.sort_values(keys).reset_index(drop=True).equals(
-            expected.sort_values(keys).reset_index(drop=True)
-        )
+        assert part.sort_values(keys).reset_index(drop=True).equals(expected.sort_values(keys).reset_index(drop=True))
     for jobs in (1, 2, 5):
         assert (len(blocks(ready, plan(), jobs)) > 1) == (jobs > 1)
         assert run(plan(), [log], jobs=jobs).table.equals(whole)
@@ -160,7 +156,7 @@ def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
 
 def test_a_runs_states_do_not_depend_on_how_many_runs_there_are() -> None:
     log = busy_log()
-    a, b = (believed(prepare(log, plan(runs)), plan(runs), 3)["both"] for runs in (4, 12))
+    a, b = (believed(prepare(log, plan(runs)), plan(runs), 3)["both"].fused for runs in (4, 12))
     for name in ("valid", "x_m", "y_m"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
@@ -194,13 +190,15 @@ def tracks_at(fused: Tracks, log: Recording) -> dict[tuple[str, int], tuple[floa
 
 def test_cropping_the_log_changes_no_draw() -> None:
     whole, cropped = busy_log(), busy_log(from_s=1.5)
-    a, b = (tracks_at(believed(prepare(log, plan()), plan(), 2)["PEM"], log) for log in (whole, cropped))
+    a, b = (tracks_at(believed(prepare(log, plan()), plan(), 2)["PEM"].fused, log) for log in (whole, cropped))
     assert b
     assert {key: value for key, value in a.items() if key[1] >= cropped.scene.t0_ns} == b
 
 
 def test_another_log_has_other_dice() -> None:
-    a, b = (tracks_at(believed(prepare(log, plan()), plan(), 2)["PEM"], log) for log in (busy_log("a"), busy_log("b")))
+    a, b = (
+        tracks_at(believed(prepare(log, plan()), plan(), 2)["PEM"].fused, log) for log in (busy_log("a"), busy_log("b"))
+    )
     assert set(a) != set(b)
     assert not set(a.values()) & set(b.values())
 
@@ -210,4 +208,4 @@ def test_configurations_share_their_draws() -> None:
     log, both = busy_log(), plan(configurations={"PEM": {"units": ["ego"]}, "all": {"units": "all"}})
     for number in range(5):
         fused = believed(prepare(log, both), both, number)
-        assert set(tracks_at(fused["PEM"], log)) <= set(tracks_at(fused["all"], log))
+        assert set(tracks_at(fused["PEM"].fused, log)) <= set(tracks_at(fused["all"].fused, log))

@@ -1,6 +1,6 @@
 """Benchmarks, one JSON line each. Ratios are taken within one run: trust them, not the absolute figures.
 
-    python tools/bench.py [name …]
+python tools/bench.py [name …]
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def writing() -> Iterator[dict[str, object]]:
 
     experiment, recordings = _loaded(ROOT / "logs/tc016d.yaml")
     ready = prepare(recordings[0], experiment)
-    beliefs = believed(ready, experiment, 0)
+    beliefs = {name: belief.fused for name, belief in believed(ready, experiment, 0).items()}
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
     rows, _ = summary(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))

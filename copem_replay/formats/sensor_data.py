@@ -7,12 +7,14 @@ virtual sensor's). `base_rmse` holds standard deviations. `ground_truth_id` is t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from copem_replay.chance import object_words
-from copem_replay.tracks import CLASSES, Float, Scene, Tracks
+from copem_replay.fusion.ideal import Belief
+from copem_replay.tracks import CLASSES, Float, Scene
 
 SCHEMA = "osi3.SensorData"
 OSI_VERSION = (3, 8, 0)
@@ -31,7 +33,7 @@ _OSI_TYPE: dict[str, tuple[int, int | None]] = {
     "bicycle": (2, 11),
     "bus": (2, 12),
 }
-_MEASURED = 2  # osi_detectedobject.proto: MEASUREMENT_STATE_MEASURED
+_MEASURED, _STALE = 2, 1  # osi_detectedobject.proto: MEASUREMENT_STATE_MEASURED, _OTHER: from an older list only
 
 
 def osi_id(object_id: str) -> int:
@@ -48,10 +50,15 @@ def message_class() -> Any:
 
 
 class SensorDataWriter:
-    """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
+    """Turns the fused lists of one run (values (1, P)) into messages, list by list.
 
-    def __init__(self, scene: Scene, fused: Tracks) -> None:
-        self._scene, self._fused = scene, fused
+    `unit_numbers` are the numbers by which `sensor_id` names the units that contributed.
+    """
+
+    def __init__(self, scene: Scene, belief: Belief, unit_numbers: Mapping[str, int]) -> None:
+        fused = belief.fused
+        self._scene, self._belief, self._fused = scene, belief, fused
+        self._unit_numbers = [unit_numbers[name] for name in belief.heard.units]
         self._order, self._bounds = fused.by_frame
         self._ids = [osi_id(name) for name in scene.object_ids]
         self._columns = {
@@ -87,6 +94,13 @@ class SensorDataWriter:
         encoded: bytes = data.SerializeToString(deterministic=True)
         return encoded
 
+    def _contributors(self, row: int) -> list[tuple[int, int]]:
+        """Unit index and capture stamp of each entry that the row was made of, by unit."""
+        heard, entries = self._belief.heard, self._belief.entries
+        mine = entries[self._belief.start[row] : self._belief.start[row + 1]]
+        mine = mine[heard.valid[0, mine]]
+        return list(zip(heard.row_unit_ix[mine].tolist(), heard.stamp_ns[heard.frame_ix[mine]].tolist(), strict=True))
+
     def _add(self, data: Any, row: int) -> None:
         number = int(self._fused.row_object_ix[row])
         moving = bool(self._scene.moving[number])
@@ -94,7 +108,11 @@ class SensorDataWriter:
         item.header.tracking_id.value = self._ids[number]
         item.header.ground_truth_id.add().value = self._ids[number]
         item.header.existence_probability = 1.0
-        item.header.measurement_state = _MEASURED
+        fresh = False
+        for unit, captured_ns in self._contributors(row):
+            item.header.sensor_id.add().value = self._unit_numbers[unit]
+            fresh |= captured_ns == self._fused.stamp_ns[self._fused.frame_ix[row]]
+        item.header.measurement_state = _MEASURED if fresh else _STALE
         value = {name: float(column[row]) for name, column in self._columns.items()}
         sigma = {name: float(column[row]) for name, column in self._sigma.items()}
         base, spread = item.base, item.base_rmse

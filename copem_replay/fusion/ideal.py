@@ -7,20 +7,35 @@ paper leaves open is combined by inverse variance as well: yaw on the circle, si
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numba as nb
 import numpy as np
 
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.fusion.inbox import inbox
+from copem_replay.pem.look import Look
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
 
 SMALLEST_VARIANCE = 1e-9
 """A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
 
 
-def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Tracks:
+@dataclass(frozen=True)
+class Belief:
+    """What the receiver believes, and which entries of the units' lists each fused row was made of.
+
+    `entries[start[p]:start[p + 1]]` are the rows of `heard` behind row p of `fused`, those that were not detected too.
+    """
+
+    fused: Tracks
+    heard: Tracks
+    entries: Int  # (C,)
+    start: Int  # (P + 1,)
+    look: Look | None = None  # how the rows of `heard` look from their units; the truth needs none
+
+
+def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Belief:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`.
 
     `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
@@ -47,7 +62,7 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Tra
     captured = np.where(box.newest >= 0, heard.captured_s[box.newest], -np.inf).max(axis=1, initial=-np.inf)
     stamps = np.where(box.newest >= 0, heard.stamp_ns[box.newest], np.iinfo(np.int64).min).max(axis=1)
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
-    return Tracks(
+    fused = Tracks(
         units=("fused",),
         start=np.append(first, len(object_ix)),
         unit_ix=np.zeros(len(first), dtype=np.int64),
@@ -63,10 +78,12 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Tra
         speed_var_m2ps2=_combine(heard, heard.z_m, "speed_var_m2ps2", rows, start)[1],
         **out,
     )
+    return Belief(fused, heard, rows, start)
 
 
-def draw_posterior(expected: Tracks, scene: Scene, seed: int, runs: Int) -> Tracks:
+def draw_posterior(belief: Belief, scene: Scene, seed: int, runs: Int) -> Belief:
     """One draw of ε ~ N(μ, Σ) per object and list, around the fused expected states (S, P)."""
+    expected = belief.fused
     words = object_words(scene.object_ids)[expected.row_object_ix]
     zero = np.zeros(len(words), dtype=np.int64)
     address = Address(("",), zero, words, expected.stamp_ns[expected.frame_ix])
@@ -79,7 +96,8 @@ def draw_posterior(expected: Tracks, scene: Scene, seed: int, runs: Int) -> Trac
     l11 = np.sqrt(expected.cov_ee_m2)
     l21 = expected.cov_en_m2 / l11
     l22 = np.sqrt(np.maximum(expected.cov_nn_m2 - l21**2, 0.0))
-    return replace(expected, x_m=expected.x_m + l11 * z1, y_m=expected.y_m + l21 * z1 + l22 * z2)
+    drawn = replace(expected, x_m=expected.x_m + l11 * z1, y_m=expected.y_m + l21 * z1 + l22 * z2)
+    return replace(belief, fused=drawn)
 
 
 def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[Int, Int, Int, Int]:

@@ -1,0 +1,127 @@
+"""Object lists as they were recorded: osi3.SensorData on one topic of a recording, as tracks of one unit.
+
+A list is captured at its `last_measurement_time`, else at its time stamp, and arrives at its time stamp. Positions are
+in the world where the message has no host location, else they are transformed from the virtual sensor's frame. What
+this project wrote beside its own lists (`…/detail`) gives the full covariances back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from copem_replay import container
+from copem_replay.errors import RecordingError
+from copem_replay.formats import detail, sensor_data
+from copem_replay.resample import wrap
+from copem_replay.tracks import UNCERTAINTIES, VALUES, Scene, Tracks
+
+
+@dataclass
+class _Rows:
+    """Entries of all lists, in the order of the messages."""
+
+    stamps: list[tuple[int, int]] = field(default_factory=list)  # captured, arrives
+    frame: list[int] = field(default_factory=list)
+    ident: list[int] = field(default_factory=list)  # ground truth id, −1: none
+    track: list[int] = field(default_factory=list)
+    values: list[tuple[float, ...]] = field(default_factory=list)
+    variances: list[tuple[float, ...]] = field(default_factory=list)
+
+
+def read_lists(path: Path, topic: str, scene: Scene) -> Tracks:
+    """The lists on `topic`, their objects told by the ids of `scene` (−1 where the list names no object of it).
+
+    Raises RecordingError when there is no such topic of osi3.SensorData.
+    """
+    log = container.open_log(path)
+    chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == sensor_data.SCHEMA}
+    if not chosen:
+        there = sorted(c.topic for c in log.channels if c.schema == sensor_data.SCHEMA)
+        raise RecordingError(f"{path}: no {sensor_data.SCHEMA} on topic {topic!r}; it is on {there or 'none'}")
+    beside = {c.number for c in log.channels if c.topic == f"{topic.removesuffix('/objects')}/detail"}
+    rows, details = _Rows(), {}
+    for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
+        if number in beside:
+            content = detail.parse(payload)
+            details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
+        else:
+            _add(rows, sensor_data.message_class().FromString(payload), log_time_ns)
+    return _tracks(rows, details, topic, scene)
+
+
+def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
+    stamp = message.timestamp
+    arrives_ns = stamp.seconds * 10**9 + stamp.nanos if message.HasField("timestamp") else log_time_ns
+    last = message.last_measurement_time
+    captured_ns = last.seconds * 10**9 + last.nanos if message.HasField("last_measurement_time") else arrives_ns
+    frame = len(rows.stamps)
+    rows.stamps.append((captured_ns, arrives_ns))
+    for item in [*message.moving_object, *message.stationary_object]:
+        base, spread = item.base, item.base_rmse
+        place, size, speed = base.position, base.dimension, getattr(base, "velocity", None)
+        rows.frame.append(frame)
+        truth = item.header.ground_truth_id
+        rows.ident.append(truth[0].value if truth else -1)
+        rows.track.append(item.header.tracking_id.value)
+        vx, vy = (speed.x, speed.y) if speed is not None else (0.0, 0.0)
+        x, y, z, yaw, vx, vy = _in_world(message, place.x, place.y, place.z, base.orientation.yaw, vx, vy)
+        rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
+        fast = spread.velocity.x if speed is not None else 0.0
+        sigma = (spread.position.x, 0.0, spread.position.y, spread.orientation.yaw, spread.dimension.length, fast)
+        rows.variances.append(tuple(s * s for s in sigma))
+
+
+def _in_world(
+    message: Any, x: float, y: float, z: float, yaw: float, vx: float, vy: float
+) -> tuple[float, float, float, float, float, float]:
+    """From the virtual sensor's frame, where the message says where its host is; else it is the world already."""
+    if not message.HasField("host_vehicle_location"):
+        return x, y, z, yaw, vx, vy
+    for frame in (message.mounting_position, message.host_vehicle_location):
+        cos, sin, turn = np.cos(frame.orientation.yaw), np.sin(frame.orientation.yaw), frame.orientation.yaw
+        x, y, z = (
+            cos * x - sin * y + frame.position.x,
+            sin * x + cos * y + frame.position.y,
+            z + frame.position.z,
+        )
+        vx, vy, yaw = cos * vx - sin * vy, sin * vx + cos * vy, yaw + turn
+    return float(x), float(y), float(z), float(wrap(np.array(yaw))), float(vx), float(vy)
+
+
+def _tracks(rows: _Rows, details: dict[int, dict[str, Any]], topic: str, scene: Scene) -> Tracks:
+    stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
+    by_time = np.argsort(stamps[:, 1], kind="stable")
+    place = np.empty_like(by_time)
+    place[by_time] = np.arange(len(by_time))
+    frame = place[np.array(rows.frame, dtype=np.int64)]
+    known = {sensor_data.osi_id(name): k for k, name in enumerate(scene.object_ids)}
+    object_ix = np.array([known.get(i, -1) for i in rows.ident], dtype=np.int64)
+    track = np.array(rows.track, dtype=np.uint64)
+    order = np.lexsort((frame, track, object_ix))
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (np.diff(object_ix[order]) != 0) | (np.diff(track[order]) != 0)
+    first = np.flatnonzero(new)
+    values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))[order]
+    variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))[order]
+    for p, (k, f) in enumerate(zip(object_ix[order].tolist(), frame[order].tolist(), strict=True)):
+        item = details.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
+        if item is not None:
+            variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
+    return Tracks(
+        units=(topic,),
+        start=np.append(first, len(order)),
+        unit_ix=np.zeros(len(first), dtype=np.int64),
+        object_ix=object_ix[order][first],
+        frame_ix=frame[order],
+        stamp_ns=stamps[by_time, 0],
+        captured_s=(stamps[by_time, 0] - scene.t0_ns) * 1e-9,
+        frame_unit_ix=np.zeros(len(stamps), dtype=np.int64),
+        arrives_s=((stamps[by_time, 1] - scene.t0_ns) * 1e-9)[None],
+        valid=np.ones((1, len(order)), dtype=bool),
+        **{name: values[None, :, k] for k, name in enumerate(VALUES)},
+        **{name: variances[None, :, k] for k, name in enumerate(UNCERTAINTIES)},
+    )

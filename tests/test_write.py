@@ -1,0 +1,341 @@
+"""MCAP out, read back: by the plain mcap and protobuf libraries, and by this project itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from osi3.osi_sensordata_pb2 import SensorData
+
+from copem_replay.check import problems, read_logs
+from copem_replay.errors import OutputError, RecordingError
+from copem_replay.experiment import Experiment
+from copem_replay.experiment_file import load, log_paths
+from copem_replay.fusion.ideal import Belief
+from copem_replay.lists import read_lists
+from copem_replay.read import read
+from copem_replay.replay import Replay, believed, prepare, replay_block
+from copem_replay.tracks import UNCERTAINTIES, VALUES
+from copem_replay.write import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "logs/tc016d.mcap"
+RUN = 3
+
+
+class Written:
+    """The sample scenario, written once for all tests: every kind of error, late and fresh units."""
+
+    def __init__(self, folder: Path) -> None:
+        source = load(ROOT / "logs/tc016d.yaml")
+        error = {
+            "kind": "gaussian", "covariance_m2": [[1.0, 0.3], [0.3, 0.5]], "yaw_sigma_deg": 3, "size_sigma_m": 0.05,
+            "speed_sigma_mps": 0.4,
+        }  # fmt: skip
+        for pem in source.data["pems"].values():
+            pem[0]["error"] = error
+        source.data["configurations"]["mixed"] = {"units": "all", "latency_s": {"ego": 0, "default": 0.25}}
+        experiment, found = problems(source)
+        assert experiment is not None, found
+        self.experiment: Experiment = experiment
+        (self.recording,) = read_logs(experiment, log_paths(source)[0], source)[0]
+        self.replay: Replay = prepare(self.recording, experiment)
+        self.beliefs: dict[str, Belief] = believed(self.replay, experiment, RUN)
+        self.table: pd.DataFrame = replay_block(self.replay, experiment, np.array([RUN]))
+        self.path = folder / "replay.mcap"
+        self.notes = self.write(self.path)
+
+    def write(self, path: Path, source: Path = SOURCE) -> list[str]:
+        manifest = {"experiment": "version: 1", "run": str(RUN)}
+        return write_mcap(path, source, self.replay.scene, self.beliefs, self.table, manifest)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
+    return Written(tmp_path_factory.mktemp("write"))
+
+
+def messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:
+    """Topic, log time, publish time, sequence and payload of every message, as mcap reads them."""
+    with path.open("rb") as file:
+        return [
+            (channel.topic, m.log_time, m.publish_time, m.sequence, m.data)
+            for _, channel, m in make_reader(file, validate_crcs=True).iter_messages()
+        ]
+
+
+def metadata(path: Path) -> dict[str, dict[str, str]]:
+    with path.open("rb") as file:
+        records = [(record.name, dict(record.metadata)) for record in make_reader(file).iter_metadata()]
+    assert len({name for name, _ in records}) == len(records), "no record twice"
+    return dict(records)
+
+
+def test_the_inputs_messages_are_untouched_and_all_is_in_order_of_time(written: Written) -> None:
+    out = messages(written.path)
+    assert [m for m in out if not m[0].startswith("copem/")] == messages(SOURCE)
+    times = [m[1] for m in out]
+    assert times == sorted(times)
+    assert written.notes == []
+
+
+def test_channels_and_records(written: Written) -> None:
+    with written.path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    schemas = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()}
+    for name in written.experiment.configurations:
+        assert schemas[f"copem/{name}/objects"] == "osi3.SensorData"
+        assert schemas[f"copem/{name}/scene"] == "foxglove.SceneUpdate"
+        assert schemas[f"copem/{name}/detail"] == "copem_replay.ListDetail"
+    assert len({(s.name, s.data) for s in summary.schemas.values()}) == len(summary.schemas)
+    osi = metadata(written.path)[OSI_RECORD]
+    for key in ("version", "min_osi_version", "max_osi_version", "min_protobuf_version", "max_protobuf_version"):
+        assert len(osi[key].split(".")) == 3, key
+    for key, value in metadata(SOURCE)[OSI_RECORD].items():
+        if not key.startswith(("min_", "max_")):
+            assert osi[key] == value
+    ours = metadata(written.path)[RUN_RECORD]
+    assert ours["run"] == str(RUN)
+    assert sorted(v for k, v in ours.items() if k.startswith("unit.")) == sorted(["truth", *written.experiment.units])
+
+
+@pytest.mark.parametrize("configuration", ["GT", "PEM", "coPEM:0.5s", "mixed"])
+def test_sensor_data_says_what_was_believed(written: Written, configuration: str) -> None:
+    belief, scene = written.beliefs[configuration], written.replay.scene
+    fused = belief.fused
+    lists = [m for m in messages(written.path) if m[0] == f"copem/{configuration}/objects"]
+    assert len(lists) == len(fused.stamp_ns)
+    units = {int(k[5:]): v for k, v in metadata(written.path)[RUN_RECORD].items() if k.startswith("unit.")}
+    seen = 0
+    for frame, (_topic, log_time, publish_time, _sequence, payload) in enumerate(lists):
+        data = SensorData.FromString(payload)
+        stamp = data.timestamp.seconds * 10**9 + data.timestamp.nanos
+        assert log_time == publish_time == stamp == scene.t0_ns + round(fused.arrives_s[0, frame] * 1e9)
+        captured = data.last_measurement_time.seconds * 10**9 + data.last_measurement_time.nanos
+        assert captured == fused.stamp_ns[frame]
+        assert data.HasField("mounting_position")
+        assert not data.HasField("host_vehicle_location")
+        items = {str(i.header.ground_truth_id[0].value): i for i in [*data.moving_object, *data.stationary_object]}
+        rows = [p for p in np.flatnonzero(fused.frame_ix == frame) if fused.valid[0, p]]
+        assert set(items) == {scene.object_ids[fused.row_object_ix[p]] for p in rows}
+        for p in rows:
+            seen += 1
+            item = items[scene.object_ids[fused.row_object_ix[p]]]
+            base, spread = item.base, item.base_rmse
+            assert (base.position.x, base.position.y, base.position.z) == (
+                fused.x_m[0, p],
+                fused.y_m[0, p],
+                fused.z_m[0, p],
+            )
+            assert base.orientation.yaw == fused.yaw_rad[0, p]
+            assert base.dimension.length == fused.length_m[0, p]
+            assert base.dimension.width == fused.width_m[0, p]
+            assert base.dimension.height == fused.height_m[0, p]
+            assert fused.cov_ee_m2 is not None
+            assert spread.position.x == pytest.approx(np.sqrt(fused.cov_ee_m2[0, p]))
+            assert item.header.existence_probability == 1
+            entries = belief.entries[belief.start[p] : belief.start[p + 1]]
+            behind = [k for k in entries if belief.heard.valid[0, k]]
+            assert [units[i.value] for i in item.header.sensor_id] == [
+                belief.heard.units[belief.heard.row_unit_ix[k]] for k in behind
+            ]
+            newest = max(belief.heard.stamp_ns[belief.heard.frame_ix[k]] for k in behind)
+            assert (item.header.measurement_state == 2) == (newest == captured), "measured, or only from an older list"
+    assert seen > 100
+
+
+def test_scene_updates_draw_each_list_anew(written: Written) -> None:
+    fused, scene = written.beliefs["PEM"].fused, written.replay.scene
+    updates = [m for m in messages(written.path) if m[0] == "copem/PEM/scene"]
+    assert len(updates) == len(fused.stamp_ns)
+    for frame, (_topic, log_time, _publish, _sequence, payload) in enumerate(updates):
+        update = SceneUpdate.FromString(payload)
+        assert [d.type for d in update.deletions] == [1], "one deletion of all"
+        assert update.deletions[0].timestamp.ToNanoseconds() == log_time
+        rows = [p for p in np.flatnonzero(fused.frame_ix == frame) if fused.valid[0, p]]
+        assert {e.id for e in update.entities} == {scene.object_ids[fused.row_object_ix[p]] for p in rows}
+        by_id = {e.id: e for e in update.entities}
+        for p in rows:
+            entity = by_id[scene.object_ids[fused.row_object_ix[p]]]
+            assert (entity.frame_id, entity.timestamp.ToNanoseconds()) == ("global", log_time)
+            (cube,) = entity.cubes
+            assert (cube.pose.position.x, cube.pose.position.y) == (fused.x_m[0, p], fused.y_m[0, p])
+            assert (cube.size.x, cube.size.y, cube.size.z) == (
+                fused.length_m[0, p], fused.width_m[0, p], fused.height_m[0, p],
+            )  # fmt: skip
+            yaw = 2 * np.arctan2(cube.pose.orientation.z, cube.pose.orientation.w)
+            assert np.cos(yaw - fused.yaw_rad[0, p]) == pytest.approx(1)
+
+
+def test_details_tell_entries_and_detections(written: Written) -> None:
+    belief = written.beliefs["mixed"]
+    details = [json.loads(m[4]) for m in messages(written.path) if m[0] == "copem/mixed/detail"]
+    events = [(d["available_ns"], e) for d in details for e in d["events"]]
+    row = written.table[(written.table["configuration"] == "mixed") & written.table["detected"]].iloc[0]
+    ((available_ns, event),) = events
+    assert available_ns == written.replay.scene.t0_ns + round(row["detection_s"] * 1e9)
+    assert event["object"] == row["object_id"]
+    assert event["first_unit"] == row["first_unit"]
+    assert event["time_to_detection_s"] == row["time_to_detection_s"]
+    entries = sum(len(o["entries"]) for d in details for o in d["objects"])
+    used = [k for k in belief.entries if belief.heard.valid[0, k]]
+    assert entries == len(used)
+    shares = [e["visible_share"] for d in details for o in d["objects"] for e in o["entries"]]
+    assert belief.look is not None
+    assert sorted(shares) == sorted(belief.look.visible_share[used].tolist())
+
+
+def test_read_back_as_a_log_it_is_the_input(written: Written) -> None:
+    a, b = written.recording, read(written.path, name="again")
+    assert a.scene.object_ids == b.scene.object_ids
+    assert a.scene.ego_ix == b.scene.ego_ix
+    for name in ("stamp_ns", "start", "frame_ix", "object_ix", *VALUES):
+        np.testing.assert_array_equal(getattr(a.truth, name), getattr(b.truth, name), err_msg=name)
+
+
+def rows_by_key(tracks: Any) -> dict[tuple[int, int], int]:
+    return {
+        (int(o), int(f)): p
+        for p, (o, f) in enumerate(zip(tracks.row_object_ix, tracks.frame_ix, strict=True))
+        if tracks.valid[0, p]
+    }
+
+
+@pytest.mark.parametrize("configuration", ["GT", "PEM", "coPEM:0.5s", "mixed"])
+def test_read_back_as_lists_every_column_is_there(written: Written, configuration: str) -> None:
+    fused = written.beliefs[configuration].fused
+    back = read_lists(written.path, f"copem/{configuration}/objects", written.replay.scene)
+    np.testing.assert_array_equal(back.stamp_ns, fused.stamp_ns)
+    np.testing.assert_allclose(back.arrives_s, fused.arrives_s, atol=1e-9)
+    np.testing.assert_allclose(back.captured_s, fused.captured_s, atol=1e-9)
+    ours, theirs = rows_by_key(fused), rows_by_key(back)
+    assert set(ours) == set(theirs)
+    order, other = [ours[k] for k in ours], [theirs[k] for k in ours]
+    moving = written.replay.scene.moving[fused.row_object_ix[order]]
+    for name in (*VALUES, *UNCERTAINTIES):
+        expected, found = getattr(fused, name)[0, order], getattr(back, name)[0, other]
+        keep = moving if name in ("vx_mps", "vy_mps") else np.ones(len(order), dtype=bool)
+        np.testing.assert_array_equal(found[keep], expected[keep], err_msg=name)
+
+
+def test_lists_of_a_real_unit_are_read() -> None:
+    path = ROOT.parent / "shared/data/msight_trial3.mcap"
+    if not path.exists():
+        pytest.skip("shared/data with recordings is not beside the project")
+    scene = read(path, name="trial3").scene
+    lists = read_lists(path, "mcity.RSU.SensorData", scene)
+    assert len(lists.stamp_ns) == 278
+    assert (np.diff(lists.arrives_s[0]) >= 0).all()
+    with pytest.raises(RecordingError, match=r"mcity\.RSU\.SensorData"):
+        read_lists(path, "nowhere", scene)
+
+
+def test_the_same_bytes_again(written: Written, tmp_path: Path) -> None:
+    written.write(tmp_path / "again.mcap")
+    assert (tmp_path / "again.mcap").read_bytes() == written.path.read_bytes()
+
+
+def test_written_into_its_own_output_the_old_lists_are_replaced_and_it_is_said(
+    written: Written, tmp_path: Path
+) -> None:
+    notes = written.write(tmp_path / "twice.mcap", source=written.path)
+    assert any("earlier replay" in note for note in notes)
+    assert messages(tmp_path / "twice.mcap") == messages(written.path)
+
+
+def test_metadata_attachments_and_foreign_channels_are_kept(written: Written, tmp_path: Path) -> None:
+    source = tmp_path / "rich.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="mine", library="other")
+        schema = writer.register_schema("their.Schema", "jsonschema", b"{}")
+        for _ in range(2):  # the same channel twice: libraries do that
+            channel = writer.register_channel("their/topic", "json", schema, {"b": "2", "a": "1"})
+            writer.add_message(channel, 5, b'{"x":1}', 7, 9)
+        writer.register_channel("silent", "json", schema, {})
+        writer.add_attachment(1, 2, "calibration.txt", "text/plain", b"data")
+        writer.add_metadata("their.record", {"k": "v"})
+        writer.add_metadata(OSI_RECORD, {"min_osi_version": "3.5.0", "max_osi_version": "3.10.0", "authors": "them"})
+        writer.finish()
+    written.write(tmp_path / "out.mcap", source=source)
+    assert [m for m in messages(tmp_path / "out.mcap") if m[0] == "their/topic"] == [
+        ("their/topic", 5, 7, 9, b'{"x":1}')
+    ] * 2
+    records = metadata(tmp_path / "out.mcap")
+    assert records["their.record"] == {"k": "v"}
+    osi = records[OSI_RECORD]
+    assert (osi["authors"], osi["min_osi_version"], osi["max_osi_version"]) == ("them", "3.5.0", "3.10.0")
+    with (tmp_path / "out.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "mine"
+        assert [(a.name, a.data, a.log_time) for a in reader.iter_attachments()] == [("calibration.txt", b"data", 2)]
+        summary = reader.get_summary()
+    assert summary is not None
+    assert [c.topic for c in summary.channels.values() if not c.topic.startswith("copem/")].count("their/topic") == 1
+    assert any(c.topic == "silent" for c in summary.channels.values())
+
+
+def test_a_damaged_recording_is_copied_as_far_as_it_goes(written: Written, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    content = written.path.read_bytes()
+    cut.write_bytes(content[: len(content) * 3 // 5])
+    notes = written.write(tmp_path / "out.mcap", source=cut)
+    assert any("damaged" in note for note in notes)
+    truth = [m for m in messages(tmp_path / "out.mcap") if m[0] == "ground_truth"]
+    assert 0 < len(truth) < 81
+    assert truth == messages(SOURCE)[: len(truth)]
+
+
+def test_nothing_is_left_when_writing_fails(written: Written, tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "out.mcap"
+    with pytest.raises(ZeroDivisionError), atomic_mcap(target, profile=""):
+        raise ZeroDivisionError
+    assert list(target.parent.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        written.write(tmp_path / "file" / "out.mcap")
+
+
+KILLED = """
+import sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+import copem_replay.write as write
+from test_write import Written
+folder = Path({folder!r})
+original = write.Writer.add_message
+count = 0
+def slowly(self, *args, **kwargs):
+    global count
+    count += 1
+    if count == {stop}:
+        print("now", flush=True)
+        sys.stdin.read()
+    return original(self, *args, **kwargs)
+write.Writer.add_message = slowly
+Written(folder)
+"""
+
+
+@pytest.mark.parametrize("stop", [1, 300, 1200])
+def test_killed_at_any_moment_no_half_written_file_has_the_name(tmp_path: Path, stop: int) -> None:
+    code = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path), stop=stop)
+    child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert child.stdout is not None
+    assert child.stdin is not None
+    assert child.stdout.readline() == b"now\n"
+    os.kill(child.pid, signal.SIGKILL)
+    child.communicate()
+    assert not (tmp_path / "replay.mcap").exists()
