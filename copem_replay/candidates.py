@@ -18,6 +18,7 @@ from copem_replay.units import (
     Poses,
     carrier,
     list_instants,
+    observers,
     place_obstacles,
     poses,
     unit_ground,
@@ -76,9 +77,7 @@ def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidate
         shares = visible_shares(
             world,
             static,
-            np.stack([np.stack([p.x_m, p.y_m, p.z_m], axis=-1) for p in places]),
-            np.stack([p.present for p in places]),
-            carriers,
+            observers(places, carriers),
             flat=experiment.visibility == "flat",
         )
         for k, name in enumerate(names):

@@ -15,7 +15,7 @@ from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Appears, At, Experiment, InRange, LineOfSight, Measure, StartsMoving
 from copem_replay.resample import states_at, wrap
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
-from copem_replay.units import carrier, poses, unit_ground
+from copem_replay.units import carrier, observers, poses, unit_ground
 from copem_replay.visibility import Statics, visible_shares
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
@@ -190,9 +190,7 @@ def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: Experi
     shares = visible_shares(
         truth,
         static,
-        np.stack([np.stack([p.x_m, p.y_m, p.z_m], axis=-1) for p in places]),
-        np.stack([p.present for p in places]),
-        np.array([carrier(scene, u) for u in chosen.values()]),
+        observers(places, np.array([carrier(scene, u) for u in chosen.values()])),
         flat=experiment.visibility == "flat",
     )
     best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)

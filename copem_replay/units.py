@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from copem_replay.experiment import Obstacle, Unit
 from copem_replay.resample import wrap
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
-from copem_replay.visibility import NO_STATICS, Statics, statics
+from copem_replay.visibility import NO_STATICS, Observers, Statics, statics
 
 GROUND_WITHIN_M = 50.0
 """How far the nearest object may be whose ground is taken for a fixed place (the contract's)."""
@@ -58,6 +59,15 @@ def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
         y = y + np.sin(yaw) * forward + np.cos(yaw) * left
         heading = wrap(yaw + np.deg2rad(unit.yaw_deg))
     return Poses(x, y, z + unit.height_m, heading, present)
+
+
+def observers(places: Sequence[Poses], carriers: Int) -> Observers:
+    """Units at the lists of one world, as visibility wants them; `carriers (U,)` object indices."""
+    return Observers(
+        np.stack([np.stack([p.x_m, p.y_m, p.z_m], axis=-1) for p in places]),
+        np.stack([p.present for p in places]),
+        carriers,
+    )
 
 
 def carrier(scene: Scene, unit: Unit) -> int:

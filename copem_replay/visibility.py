@@ -66,44 +66,65 @@ NO_STATICS = Statics(
 )
 
 
-def visible_shares(
-    world: Tracks,
-    static: Statics,
-    observer_m: Float,
-    present: Bool,
-    carrier_ix: Int,
-    *,
-    flat: bool,
-    threads: int | None = None,
-) -> Float:
-    """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier.
+@dataclass(frozen=True)
+class Observers:
+    """Where units are at each list of a world: `place_m (U, F, 3)`, whether they are there `present (U, F)`.
 
-    `observer_m (U, F, 3)` is where each unit is at each list of the world, `present (U, F)` whether it is there,
-    `carrier_ix (U,)` the object that carries it (−1: none).
+    `carrier_ix (U,)`: the object that carries each, −1: none.
     """
+
+    place_m: Float
+    present: Bool
+    carrier_ix: Int
+
+
+def visible_shares(
+    world: Tracks, static: Statics, observers: Observers, *, flat: bool, threads: int | None = None
+) -> Float:
+    """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier."""
+    order, _bounds = world.by_frame
+    seen, _blocker = _views(world, static, observers, flat, threads, blockers=False)
+    shares = np.empty_like(seen)
+    shares[:, order] = seen
+    return shares
+
+
+def hidden_by(world: Tracks, static: Statics, observers: Observers, *, flat: bool, threads: int | None = None) -> Int:
+    """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
+
+    −1: none hides any of it; −2 − k: the obstacle k.
+    """
+    order, _bounds = world.by_frame
+    _seen, found = _views(world, static, observers, flat, threads, blockers=True)
+    blocker = np.empty_like(found)
+    blocker[:, order] = np.where(found >= 0, order[found], found) if len(order) else found
+    return blocker
+
+
+def _views(
+    world: Tracks, static: Statics, observers: Observers, flat: bool, threads: int | None, *, blockers: bool
+) -> tuple[Float, Int]:
+    """Shares and blockers (U, P), rows list by list; blockers empty unless asked for."""
     order, bounds = world.by_frame
-    n_units, n_frames = present.shape
+    n_units, n_frames = observers.present.shape
+    out = np.full((n_units, len(order)), np.nan)
+    blocker = np.full((n_units, len(order)) if blockers else (0, 0), -1)
     if not len(order):
-        return np.empty((n_units, 0))
-    corners = box_corners(world)[order]
-    z, height = world.z_m[0, order], world.height_m[0, order]
+        return out, blocker
+    z, half = world.z_m[0, order], world.height_m[0, order] / 2
     arrays = (
-        bounds, corners, z - height / 2, z + height / 2, world.row_object_ix[order],
+        bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order],
         static.xy_m, static.start, static.body, static.bottom_m, static.top_m,
-        np.ascontiguousarray(observer_m), np.ascontiguousarray(present), carrier_ix, flat,
+        np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present), observers.carrier_ix, flat,
     )  # fmt: skip
     threads = threads or min(8, os.cpu_count() or 1)
-    asked = n_units * len(order)
-    pieces = max(1, min(4 * threads, asked // _ROWS_PER_THREAD, n_frames))
+    pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
     cuts = np.searchsorted(bounds, np.linspace(0, len(order), pieces + 1)[1:-1])
     edges = [0, *sorted(int(c) for c in cuts), n_frames]
-    out = np.full((n_units, len(order)), np.nan)
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda k: views(edges[k], edges[k + 1], *arrays, out), range(pieces)))
-    shares = np.empty_like(out)
-    shares[:, order] = out
-    return shares
+        list(pool.map(lambda k: views(edges[k], edges[k + 1], *arrays, out, blocker), range(pieces)))
+    return out, blocker
 
 
 def box_corners(tracks: Tracks) -> Float:

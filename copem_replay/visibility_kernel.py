@@ -25,9 +25,13 @@ _MAX_PIECES = 512
 def views(
     f0: int, f1: int, bounds: Int, corners: Float, bottom: Float, top: Float, object_ix: Int,
     static_xy: Float, static_start: Int, static_body: Int, static_bottom: Float, static_top: Float,
-    observer_m: Float, present: Bool, carrier_ix: Int, flat: bool, out: Float,
+    observer_m: Float, present: Bool, carrier_ix: Int, flat: bool, out: Float, blocker: Int,
 ) -> None:  # fmt: skip
-    """Visible shares `out (U, P)` of the lists f0 … f1 − 1; rows P list by list, `bounds (F + 1,)` their starts."""
+    """Visible shares `out (U, P)` of the lists f0 … f1 − 1; rows P list by list, `bounds (F + 1,)` their starts.
+
+    `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
+    hides any of it, −2 − k for the obstacle k.
+    """
     # Bodies of one list: the boxes first, then the static parts. Everything below is relative to the observer.
     n_static = len(static_body)
     most = n_static
@@ -45,7 +49,7 @@ def views(
     # From one observer: bearing and distance of the middle, extent in azimuth, whether it can hide anything.
     bearing, distance, lo, hi = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
     hides, inside = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
-    near = np.empty(most, dtype=np.int64)
+    near, alone = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
     work = _workspace(most, widest)
 
     for f in range(f0, f1):
@@ -119,6 +123,15 @@ def views(
                     out[u, first + t] = _share(
                         t, near, count, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work
                     )
+                if blocker.shape[0] == 0:
+                    continue
+                least = 1.0 - 1e-9
+                for i in range(count):
+                    alone[0] = near[i]
+                    left = _share(t, alone, 1, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work)
+                    if left < least:
+                        least = left
+                        blocker[u, first + t] = first + near[i] if near[i] < n else -2 - owner[near[i]]
 
 
 @nb.njit(inline="always")

@@ -13,7 +13,15 @@ from visibility_oracle import flat_share, prism, random_observer, random_scene, 
 
 from copem_replay.read import read
 from copem_replay.tracks import Tracks
-from copem_replay.visibility import NO_STATICS, Statics, box_corners, statics, visible_shares
+from copem_replay.visibility import (
+    NO_STATICS,
+    Observers,
+    Statics,
+    box_corners,
+    hidden_by,
+    statics,
+    visible_shares,
+)
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 ERROR = 0.01  # the most that any view may be off
@@ -50,14 +58,13 @@ def shares(
     world: Tracks, observer: Sequence[float], static: Statics = NO_STATICS, *, flat: bool, carrier: int = -1
 ) -> np.ndarray:
     """(P,) shares from one place."""
-    return visible_shares(
-        world,
-        static,
-        np.array(observer, dtype=float).reshape(1, 1, 3),
-        np.ones((1, 1), dtype=bool),
-        np.array([carrier]),
-        flat=flat,
-    )[0]
+    return visible_shares(world, static, at(observer, carrier), flat=flat)[0]
+
+
+def at(observer: Sequence[float], carrier: int = -1) -> Observers:
+    """One unit at one place."""
+    place = np.array(observer, dtype=float).reshape(1, 1, 3)
+    return Observers(place, np.ones((1, 1), dtype=bool), np.array([carrier]))
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -80,16 +87,12 @@ def test_random_scenes_agree_with_the_oracle(seed: int, height_m: float) -> None
         )
         for b, c in zip(boxes, corners, strict=True)
     ]
-    static = statics(
-        [b["polygon"] for b in walls], [b["z0"] for b in walls], [b["z1"] - b["z0"] for b in walls]
-    )
+    static = statics([b["polygon"] for b in walls], [b["z0"] for b in walls], [b["z1"] - b["z0"] for b in walls])
     world = one_list(poses)
     flat, surface = (shares(world, observer, static, flat=f) for f in (True, False))
     for k in range(len(boxes)):
         others = [b for b in bodies if b is not boxes[k]]
-        assert flat[k] == pytest.approx(
-            flat_share(observer[:2], corners[k], [b["polygon"] for b in others]), abs=1e-6
-        )
+        assert flat[k] == pytest.approx(flat_share(observer[:2], corners[k], [b["polygon"] for b in others]), abs=1e-6)
         assert surface[k] == pytest.approx(
             surface_share(observer, prism(boxes[k]), [prism(b) for b in others], azimuths=1500), abs=ERROR
         )
@@ -122,7 +125,11 @@ def test_a_recording_agrees_with_the_oracle(name: str) -> None:
                 for o in others
                 if o != r
             ]
-            target = (corners[r], world.z_m[0, k] - world.height_m[0, k] / 2, world.z_m[0, k] + world.height_m[0, k] / 2)
+            target = (
+                corners[r],
+                world.z_m[0, k] - world.height_m[0, k] / 2,
+                world.z_m[0, k] + world.height_m[0, k] / 2,
+            )
             assert flat[k] == pytest.approx(flat_share(place[:2], corners[r], [b[0] for b in bodies]), abs=ERROR)
             assert surface[k] == pytest.approx(surface_share(place, target, bodies, azimuths=800), abs=ERROR)
             checked += 1
@@ -137,18 +144,17 @@ def test_highway_merge_gives_the_published_table() -> None:
     wall = statics([np.array([(-220, 10), (-120, 10), (-120, 0), (-220, 0)])], [0.0], [1.0])
     ego = np.flatnonzero(truth.row_object_ix == scene.ego_ix)
     place = np.stack([truth.x_m[0, ego], truth.y_m[0, ego], np.full(len(ego), 1.8)], axis=-1)[None]
-    share = visible_shares(
-        truth, wall, place, np.ones((1, len(ego)), dtype=bool), np.array([scene.ego_ix]), flat=True
-    )[0]
+    there = np.ones((1, len(ego)), dtype=bool)
+    share = visible_shares(truth, wall, Observers(place, there, np.array([scene.ego_ix])), flat=True)[0]
 
-    def at(frame: int) -> dict[str, float]:
+    def shares_at(frame: int) -> dict[str, float]:
         rows = np.flatnonzero(truth.frame_ix == frame)
         return {scene.object_ids[truth.row_object_ix[r]]: share[r] for r in rows}
 
     for frame, expected in ((0, 0.42), (1, 0.525), (2, 0.63), (3, 0.74)):
-        assert at(frame)["1"] == pytest.approx(expected, abs=0.0051)
-        assert [at(frame)[k] for k in "2345"] == [0, 0, 0, 0]
-    assert [at(432)[k] for k in "345"] == [1, 0, 0]
+        assert shares_at(frame)["1"] == pytest.approx(expected, abs=0.0051)
+        assert [shares_at(frame)[k] for k in "2345"] == [0, 0, 0, 0]
+    assert [shares_at(432)[k] for k in "345"] == [1, 0, 0]
 
 
 def test_over_a_low_wall() -> None:
@@ -219,3 +225,18 @@ def test_rectangle_and_box_corners_agree() -> None:
     world = one_list([(3, 4, 0.7, 4, 2, 0, 1)])
     ours, theirs = box_corners(world)[0], rectangle(3, 4, 4, 2, 0.7)
     assert {tuple(np.round(c, 9)) for c in ours} == {tuple(np.round(c, 9)) for c in theirs}
+
+
+def test_who_hides_whom() -> None:
+    """Seen from 1 m: a truck hides the far box wholly, a low box in front of it half; a house hides another."""
+    world = one_list(
+        [
+            (30, 0, 0, 1, 1, 0, 2),  # hidden by both that follow, more by the truck
+            (10, 0, 0, 1, 20, 0, 1),
+            (20, 0, 0, 2, 20, 0, 4),
+            (0, 30, 0, 1, 1, 0, 2),  # behind the house
+            (-30, 0, 0, 1, 1, 0, 2),  # free
+        ]
+    )
+    house = statics([np.array([(-5, 10), (5, 10), (5, 12), (-5, 12)])], [0.0], [9.0])
+    assert hidden_by(world, house, at((0, 0, 1)), flat=False)[0].tolist() == [2, -1, 1, -2, -1]

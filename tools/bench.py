@@ -22,7 +22,7 @@ from copem_replay.experiment_file import load, log_paths
 from copem_replay.read import read
 from copem_replay.replay import believed, prepare, replay_block
 from copem_replay.tracks import TRUTH, Tracks
-from copem_replay.visibility import NO_STATICS, visible_shares
+from copem_replay.visibility import NO_STATICS, Observers, visible_shares
 
 ROOT = Path(__file__).parents[1]
 
@@ -77,11 +77,9 @@ def visibility() -> Iterator[dict[str, object]]:
     place = np.empty((units, frames, 3))
     place[..., :2] = rng.uniform(-60, 60, (units, 1, 2))
     place[..., 2] = rng.choice([1.8, 5.0], (units, 1))
-    present, carriers = np.ones((units, frames), dtype=bool), np.full(units, -1)
+    observers = Observers(place, np.ones((units, frames), dtype=bool), np.full(units, -1))
     for kind in ("flat", "surface"):
-        seconds = best(
-            lambda kind=kind: visible_shares(world, NO_STATICS, place, present, carriers, flat=kind == "flat"), 3
-        )
+        seconds = best(lambda kind=kind: visible_shares(world, NO_STATICS, observers, flat=kind == "flat"), 3)
         yield {f"visibility_{kind}_views_per_s": round(units * frames * count / seconds)}
 
 
@@ -154,7 +152,7 @@ def commands() -> Iterator[dict[str, object]]:
         yield {"demo_s": round(seconds, 2), "demo_peak_mb": round(peak_kib / 1024)}
 
 
-def _loaded(path: Path):  # noqa: ANN202
+def _loaded(path: Path):
     source = load(path)
     experiment, found = problems(source)
     assert experiment is not None, found

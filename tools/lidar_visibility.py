@@ -20,7 +20,7 @@ import pandas as pd
 from copem_replay.errors import CopemError
 from copem_replay.read import Recording, read
 from copem_replay.tracks import CLASSES, Float
-from copem_replay.visibility import NO_STATICS, visible_shares
+from copem_replay.visibility import NO_STATICS, Observers, visible_shares
 
 WITHIN_M = 60.0
 SENSOR_HEIGHT_M = 1.9
@@ -64,9 +64,9 @@ def pedestrians(recording: Recording) -> pd.DataFrame:
             "solid_angle": area_m2 / np.maximum(distance_m, 1e-9) ** 2,
         }
     )
-    carrier = np.array([scene.ego_ix])
+    observers = Observers(place, present, np.array([scene.ego_ix]))
     for kind in ("surface", "flat"):
-        table[kind] = visible_shares(truth, NO_STATICS, place, present, carrier, flat=kind == "flat")[0]
+        table[kind] = visible_shares(truth, NO_STATICS, observers, flat=kind == "flat")[0]
     return table[keep]
 
 
