@@ -116,17 +116,18 @@ def writing() -> Iterator[dict[str, object]]:
 
     experiment, recordings = _loaded(ROOT / "logs/tc016d.yaml")
     ready = prepare(recordings[0], experiment)
-    beliefs = {name: belief.fused for name, belief in believed(ready, experiment, 0).items()}
+    beliefs = believed(ready, experiment, 0)
+    fused = {name: belief.fused for name, belief in beliefs.items()}
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
     rows, _ = summary(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
-    listed = sum(int(fused.valid.sum()) for fused in beliefs.values())
+    listed = sum(int(lists.valid.sum()) for lists in fused.values())
     shown = listed + len(ready.truth.frame_ix)
     with _scratch() as folder:
         mcap, rrd = folder / "w.mcap", folder / "w.rrd"
-        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, beliefs), 3)
+        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, beliefs, table, {}), 3)
         yield {"mcap_objects_per_s": round(listed / seconds)}
-        seconds = best(lambda: write_rrd(rrd, ready, experiment, beliefs, table, rows, 0), 3)
+        seconds = best(lambda: write_rrd(rrd, ready, experiment, fused, table, rows, 0), 3)
         yield {
             "rrd_boxes_per_s": round(shown / seconds),
             "rrd_bytes_per_box": round(rrd.stat().st_size / shown, 1),
