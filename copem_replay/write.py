@@ -2,8 +2,8 @@
 
 For each configuration three channels: `copem/<configuration>/objects` (osi3.SensorData), `…/scene`
 (foxglove.SceneUpdate) and `…/detail` (JSON: what SensorData cannot carry), one message per fused list, log_time =
-publish_time = the instant it was available. The same input gives the same bytes; the file appears under its name when it
-is complete, or not at all.
+publish_time = the instant it was available. The same input gives the same bytes; the file appears under its name when
+it is complete, or not at all.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def write_mcap(
             events = _events(belief.fused, table[table["configuration"] == name])
             writers = {
                 objects: sensor_data.SensorDataWriter(scene, belief, numbers),
-                scenes: foxglove.SceneWriter(scene, belief.fused, name, colours[name]),
+                scenes: foxglove.SceneWriter(scene, belief, name, colours[name]),
                 details: detail.DetailWriter(scene, belief, events),
             }
             streams.append(_lists(scene, belief.fused, writers))

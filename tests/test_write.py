@@ -189,10 +189,10 @@ def test_details_tell_entries_and_detections(written: Written) -> None:
     assert event["object"] == row["object_id"]
     assert event["first_unit"] == row["first_unit"]
     assert event["time_to_detection_s"] == row["time_to_detection_s"]
-    entries = sum(len(o["entries"]) for d in details for o in d["objects"])
+    entries = sum(len(o["units"]) for d in details for o in d["objects"])
     used = [k for k in belief.entries if belief.heard.valid[0, k]]
     assert entries == len(used)
-    shares = [e["visible_share"] for d in details for o in d["objects"] for e in o["entries"]]
+    shares = [share for d in details for o in d["objects"] for share in o["visible_share"]]
     assert belief.look is not None
     assert sorted(shares) == sorted(belief.look.visible_share[used].tolist())
 

@@ -1,7 +1,7 @@
 """What osi3.SensorData cannot carry of a fused list, losslessly, as JSON beside it.
 
 One message per list on `copem/<configuration>/detail`: the full covariance and variances of each object, the entries of
-the units' lists it was made of (unit, capture, range, visible share), and what was detected with this list.
+the units' lists it was made of (parallel lists of unit, capture, range, visible share), and what was detected with it.
 """
 
 from __future__ import annotations
@@ -31,18 +31,10 @@ JSON_SCHEMA = {
                 "properties": {
                     "id": {"type": "string"},
                     **dict.fromkeys(UNCERTAINTIES, _NUMBER),
-                    "entries": {
-                        "type": "array",
-                        "items": {
-                            "type": "object",
-                            "properties": {
-                                "unit": {"type": "string"},
-                                "captured_ns": {"type": "integer"},
-                                "range_m": _NUMBER,
-                                "visible_share": _NUMBER,
-                            },
-                        },
-                    },
+                    "units": {"type": "array", "items": {"type": "string"}},
+                    "captured_ns": {"type": "array", "items": {"type": "integer"}},
+                    "range_m": {"type": "array", "items": _NUMBER},
+                    "visible_share": {"type": "array", "items": _NUMBER},
                 },
             },
         },
@@ -58,41 +50,38 @@ class DetailWriter:
     """
 
     def __init__(self, scene: Scene, belief: Belief, events: Mapping[int, Sequence[Event]]) -> None:
-        self._scene, self._belief, self._events = scene, belief, events
-        self._order, self._bounds = belief.fused.by_frame
+        fused, heard, used = belief.fused, belief.heard, belief.used
+        self._fused, self._listed, self._events = fused, belief.listed, events
+        self._ids = [scene.object_ids[k] for k in fused.row_object_ix]
         self._variances = {
-            name: [None] * len(belief.fused.frame_ix) if (a := getattr(belief.fused, name)) is None else a[0].tolist()
+            name: [None] * len(fused.frame_ix) if (a := getattr(fused, name)) is None else a[0].tolist()
             for name in UNCERTAINTIES
         }
+        nothing: list[float | None] = [None] * len(used)
+        self._entries: dict[str, list[Any]] = {
+            "units": [heard.units[k] for k in heard.row_unit_ix[used]],
+            "captured_ns": heard.stamp_ns[heard.frame_ix[used]].tolist(),
+            "range_m": nothing if belief.look is None else belief.look.range_m[used].tolist(),
+            "visible_share": nothing if belief.look is None else belief.look.visible_share[used].tolist(),
+        }
+        self._start = belief.used_start.tolist()
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
-        fused = self._belief.fused
-        rows = self._order[self._bounds[frame] : self._bounds[frame + 1]]
         content = {
             "available_ns": available_ns,
-            "captured_ns": int(fused.stamp_ns[frame]),
-            "objects": [self._object(row) for row in rows[fused.valid[0, rows]].tolist()],
+            "captured_ns": int(self._fused.stamp_ns[frame]),
+            "objects": [self._object(row) for row in self._listed(frame)],
             "events": list(self._events.get(frame, ())),
         }
         return json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=False).encode()
 
     def _object(self, row: int) -> dict[str, Any]:
-        belief = self._belief
-        heard, look = belief.heard, belief.look
-        entries = belief.entries[belief.start[row] : belief.start[row + 1]]
+        first, last = self._start[row], self._start[row + 1]
         return {
-            "id": self._scene.object_ids[belief.fused.row_object_ix[row]],
+            "id": self._ids[row],
             **{name: values[row] for name, values in self._variances.items()},
-            "entries": [
-                {
-                    "unit": heard.units[heard.row_unit_ix[k]],
-                    "captured_ns": int(heard.stamp_ns[heard.frame_ix[k]]),
-                    "range_m": None if look is None else float(look.range_m[k]),
-                    "visible_share": None if look is None else float(look.visible_share[k]),
-                }
-                for k in entries[heard.valid[0, entries]].tolist()
-            ],
+            **{name: values[first:last] for name, values in self._entries.items()},
         }
 
 

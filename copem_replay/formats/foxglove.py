@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from copem_replay.colours import Rgb
-from copem_replay.tracks import CLASSES, Scene, Tracks
+from copem_replay.fusion.ideal import Belief
+from copem_replay.tracks import CLASSES, Scene
 
 SCHEMA = "foxglove.SceneUpdate"
 FRAME_ID = "global"
@@ -28,11 +29,15 @@ def message_class() -> Any:
 class SceneWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
 
-    def __init__(self, scene: Scene, fused: Tracks, configuration: str, colour: Rgb) -> None:
-        self._scene, self._fused, self._colour = scene, fused, tuple(c / 255 for c in colour)
-        self._configuration = configuration
-        self._order, self._bounds = fused.by_frame
-        self._half_yaw = np.nan_to_num(fused.yaw_rad[0]) / 2
+    def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb) -> None:
+        fused = belief.fused
+        self._listed = belief.listed
+        self._object_ix = fused.row_object_ix.tolist()
+        # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
+        self._prototype = [_prototype(scene, k, configuration, colour) for k in range(len(scene.object_ids))]
+        half = fused.yaw_rad[0] / 2
+        columns = [getattr(fused, n)[0] for n in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")]
+        self._values = list(zip(*(c.tolist() for c in (*columns, np.sin(half), np.cos(half))), strict=True))
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
@@ -42,30 +47,29 @@ class SceneWriter:
         deletion = update.deletions.add()
         deletion.type = SceneEntityDeletion.ALL
         deletion.timestamp.FromNanoseconds(available_ns)
-        rows = self._order[self._bounds[frame] : self._bounds[frame + 1]]
-        for row in rows[self._fused.valid[0, rows]].tolist():
-            self._add(update.entities.add(), row, available_ns)
+        for row in self._listed(frame):
+            entity = update.entities.add()
+            entity.CopyFrom(self._prototype[self._object_ix[row]])
+            entity.timestamp.CopyFrom(deletion.timestamp)
+            cube = entity.cubes[0]
+            at, turn, size = cube.pose.position, cube.pose.orientation, cube.size
+            at.x, at.y, at.z, size.x, size.y, size.z, turn.z, turn.w = self._values[row]
         encoded: bytes = update.SerializeToString(deterministic=True)
         return encoded
 
-    def _add(self, entity: Any, row: int, available_ns: int) -> None:
-        fused, number = self._fused, int(self._fused.row_object_ix[row])
-        entity.timestamp.FromNanoseconds(available_ns)
-        entity.frame_id = FRAME_ID
-        entity.id = self._scene.object_ids[number]
-        for key, text in (
-            ("configuration", self._configuration),
-            ("class", CLASSES[self._scene.object_class[number]]),
-            ("object", self._scene.object_ids[number]),
-        ):
-            pair = entity.metadata.add()
-            pair.key, pair.value = key, text
-        cube = entity.cubes.add()
-        at = cube.pose.position
-        at.x, at.y, at.z = float(fused.x_m[0, row]), float(fused.y_m[0, row]), float(fused.z_m[0, row])
-        half = self._half_yaw[row]
-        cube.pose.orientation.z, cube.pose.orientation.w = float(np.sin(half)), float(np.cos(half))
-        size = cube.size
-        size.x, size.y, size.z = (float(getattr(fused, n)[0, row]) for n in ("length_m", "width_m", "height_m"))
-        cube.color.r, cube.color.g, cube.color.b = self._colour
-        cube.color.a = 0.5
+
+def _prototype(scene: Scene, number: int, configuration: str, colour: Rgb) -> Any:
+    """A box with all that its object and its configuration say."""
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+
+    entity = SceneEntity(frame_id=FRAME_ID, id=scene.object_ids[number])
+    for key, text in (
+        ("configuration", configuration),
+        ("class", CLASSES[scene.object_class[number]]),
+        ("object", scene.object_ids[number]),
+    ):
+        entity.metadata.add(key=key, value=text)
+    color = entity.cubes.add().color
+    color.r, color.g, color.b = (c / 255 for c in colour)
+    color.a = 0.5
+    return entity

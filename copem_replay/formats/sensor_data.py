@@ -14,7 +14,7 @@ import numpy as np
 
 from copem_replay.chance import object_words
 from copem_replay.fusion.ideal import Belief
-from copem_replay.tracks import CLASSES, Float, Scene
+from copem_replay.tracks import CLASSES, VALUES, Float, Scene
 
 SCHEMA = "osi3.SensorData"
 OSI_VERSION = (3, 8, 0)
@@ -57,85 +57,75 @@ class SensorDataWriter:
 
     def __init__(self, scene: Scene, belief: Belief, unit_numbers: Mapping[str, int]) -> None:
         fused = belief.fused
-        self._scene, self._belief, self._fused = scene, belief, fused
-        self._unit_numbers = [unit_numbers[name] for name in belief.heard.units]
-        self._order, self._bounds = fused.by_frame
-        self._ids = [osi_id(name) for name in scene.object_ids]
-        self._columns = {
-            name: getattr(fused, name)[0]
-            for name in (
-                "x_m",
-                "y_m",
-                "z_m",
-                "yaw_rad",
-                "vx_mps",
-                "vy_mps",
-                "length_m",
-                "width_m",
-                "height_m",
-            )
-        }
-        self._sigma = {
-            name: _sigma(getattr(fused, name), len(fused.frame_ix))
-            for name in ("cov_ee_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
-        }
+        self._fused, self._listed = fused, belief.listed
+        self._moving = scene.moving[fused.row_object_ix].tolist()
+        self._object_ix = fused.row_object_ix.tolist()
+        # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
+        self._prototype = [_prototype(scene, number) for number in range(len(scene.object_ids))]
+        self._values = list(zip(*(getattr(fused, name)[0].tolist() for name in VALUES), strict=True))
+        spread = ("cov_ee_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
+        self._sigma = list(zip(*(_sigma(getattr(fused, name), len(fused.frame_ix)) for name in spread), strict=True))
+        heard = belief.heard
+        self._unit = np.array([unit_numbers[name] for name in heard.units])[heard.row_unit_ix[belief.used]].tolist()
+        self._captured_ns = heard.stamp_ns[heard.frame_ix[belief.used]].tolist()
+        self._used_start = belief.used_start.tolist()
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
         data = message_class()()
         data.version.version_major, data.version.version_minor, data.version.version_patch = OSI_VERSION
+        captured_ns = int(self._fused.stamp_ns[frame])
         _stamp(data.timestamp, available_ns)
-        _stamp(data.last_measurement_time, int(self._fused.stamp_ns[frame]))
+        _stamp(data.last_measurement_time, captured_ns)
         data.mounting_position.position.SetInParent()
         data.mounting_position.orientation.SetInParent()
-        rows = self._order[self._bounds[frame] : self._bounds[frame + 1]]
-        for row in rows[self._fused.valid[0, rows]].tolist():
-            self._add(data, row)
+        for row in self._listed(frame):
+            self._add(data.moving_object if self._moving[row] else data.stationary_object, row, captured_ns)
         encoded: bytes = data.SerializeToString(deterministic=True)
         return encoded
 
-    def _contributors(self, row: int) -> list[tuple[int, int]]:
-        """Unit index and capture stamp of each entry that the row was made of, by unit."""
-        heard, entries = self._belief.heard, self._belief.entries
-        mine = entries[self._belief.start[row] : self._belief.start[row + 1]]
-        mine = mine[heard.valid[0, mine]]
-        return list(zip(heard.row_unit_ix[mine].tolist(), heard.stamp_ns[heard.frame_ix[mine]].tolist(), strict=True))
-
-    def _add(self, data: Any, row: int) -> None:
-        number = int(self._fused.row_object_ix[row])
-        moving = bool(self._scene.moving[number])
-        item = data.moving_object.add() if moving else data.stationary_object.add()
-        item.header.tracking_id.value = self._ids[number]
-        item.header.ground_truth_id.add().value = self._ids[number]
-        item.header.existence_probability = 1.0
-        fresh = False
-        for unit, captured_ns in self._contributors(row):
-            item.header.sensor_id.add().value = self._unit_numbers[unit]
-            fresh |= captured_ns == self._fused.stamp_ns[self._fused.frame_ix[row]]
-        item.header.measurement_state = _MEASURED if fresh else _STALE
-        value = {name: float(column[row]) for name, column in self._columns.items()}
-        sigma = {name: float(column[row]) for name, column in self._sigma.items()}
-        base, spread = item.base, item.base_rmse
-        base.position.x, base.position.y, base.position.z = value["x_m"], value["y_m"], value["z_m"]
-        base.orientation.yaw = value["yaw_rad"]
-        size = base.dimension
-        size.length, size.width, size.height = value["length_m"], value["width_m"], value["height_m"]
-        spread.position.x, spread.position.y = sigma["cov_ee_m2"], sigma["cov_nn_m2"]
-        spread.orientation.yaw = sigma["yaw_var_rad2"]
-        spread.dimension.length = spread.dimension.width = spread.dimension.height = sigma["size_var_m2"]
-        if moving:
-            base.velocity.x, base.velocity.y = value["vx_mps"], value["vy_mps"]
-            spread.velocity.x = spread.velocity.y = sigma["speed_var_m2ps2"]
-            candidate = item.candidate.add()
-            candidate.probability = 1.0
-            candidate.type, vehicle = _OSI_TYPE[CLASSES[self._scene.object_class[number]]]
-            if vehicle is not None:
-                candidate.vehicle_classification.type = vehicle
+    def _add(self, items: Any, row: int, captured_ns: int) -> None:
+        item = items.add()
+        item.CopyFrom(self._prototype[self._object_ix[row]])
+        header, base, spread = item.header, item.base, item.base_rmse
+        first, last = self._used_start[row], self._used_start[row + 1]
+        sensors = header.sensor_id
+        for unit in self._unit[first:last]:
+            sensors.add().value = unit
+        header.measurement_state = _MEASURED if captured_ns in self._captured_ns[first:last] else _STALE
+        position, size = base.position, base.dimension
+        position.x, position.y, position.z, base.orientation.yaw, vx, vy, size.length, size.width, size.height = (
+            self._values[row]
+        )
+        spread.position.x, spread.position.y, spread.orientation.yaw, around, fast = self._sigma[row]
+        off = spread.dimension
+        off.length = off.width = off.height = around
+        if self._moving[row]:
+            base.velocity.x, base.velocity.y = vx, vy
+            spread.velocity.x = spread.velocity.y = fast
 
 
-def _sigma(variance: Float | None, rows: int) -> Float:
+def _prototype(scene: Scene, number: int) -> Any:
+    """A detected object with all that its id and class say."""
+    from osi3.osi_detectedobject_pb2 import DetectedMovingObject, DetectedStationaryObject
+
+    moving = bool(scene.moving[number])
+    item = DetectedMovingObject() if moving else DetectedStationaryObject()
+    item.header.tracking_id.value = osi_id(scene.object_ids[number])
+    item.header.ground_truth_id.add().value = osi_id(scene.object_ids[number])
+    item.header.existence_probability = 1.0
+    if moving:
+        candidate = item.candidate.add()
+        candidate.probability = 1.0
+        candidate.type, vehicle = _OSI_TYPE[CLASSES[scene.object_class[number]]]
+        if vehicle is not None:
+            candidate.vehicle_classification.type = vehicle
+    return item
+
+
+def _sigma(variance: Float | None, rows: int) -> list[float]:
     """(P,) standard deviations; 0 where the state is exact."""
-    return np.zeros(rows) if variance is None else np.sqrt(np.nan_to_num(variance[0]))
+    return [0.0] * rows if variance is None else np.sqrt(np.nan_to_num(variance[0])).tolist()
 
 
 def _stamp(field: Any, time_ns: int) -> None:

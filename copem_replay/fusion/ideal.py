@@ -8,6 +8,7 @@ paper leaves open is combined by inverse variance as well: yaw on the circle, si
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numba as nb
 import numpy as np
@@ -23,16 +24,31 @@ SMALLEST_VARIANCE = 1e-9
 
 @dataclass(frozen=True)
 class Belief:
-    """What the receiver believes, and which entries of the units' lists each fused row was made of.
-
-    `entries[start[p]:start[p + 1]]` are the rows of `heard` behind row p of `fused`, those that were not detected too.
-    """
+    """What the receiver believes in one run, and which entries of the units' lists each fused row was made of."""
 
     fused: Tracks
     heard: Tracks
-    entries: Int  # (C,)
-    start: Int  # (P + 1,)
+    entries: Int  # (C,) rows of `heard`, those that were not detected too
+    start: Int  # (P + 1,) where the entries of each fused row begin
     look: Look | None = None  # how the rows of `heard` look from their units; the truth needs none
+
+    @cached_property
+    def used(self) -> Int:
+        """The entries that were detected, (C',) rows of `heard`, grouped by `used_start`."""
+        return self.entries[self.heard.valid[0, self.entries]]
+
+    @cached_property
+    def used_start(self) -> Int:
+        """(P + 1,) where the detected entries of each fused row begin."""
+        before: Int = np.concatenate([[0], np.cumsum(self.heard.valid[0, self.entries])])
+        return before[self.start]
+
+    def listed(self, frame: int) -> list[int]:
+        """Rows of `fused` that are in one list."""
+        order, bounds = self.fused.by_frame
+        rows = order[bounds[frame] : bounds[frame + 1]]
+        result: list[int] = rows[self.fused.valid[0, rows]].tolist()
+        return result
 
 
 def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Belief:

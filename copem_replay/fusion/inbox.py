@@ -31,7 +31,8 @@ def inbox(heard: Tracks, *, max_age_s: float) -> Inbox:
     issue_s = ordered[last]
     newest = np.full((len(issue_s), max(len(heard.units), 1)), -1)
     for unit in range(len(heard.units)):
-        mine = np.flatnonzero(heard.frame_unit_ix == unit)  # in order of capture
+        # In order of capture, and so of arrival; without those that were lost.
+        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(arrives_s))
         at = np.searchsorted(arrives_s[mine], issue_s + tolerance_s, side="right") - 1
         known = at >= 0
         frame = mine[at[known]]
