@@ -35,13 +35,15 @@ class Belief:
     @cached_property
     def used(self) -> Int:
         """The entries that were detected, (C',) rows of `heard`, grouped by `used_start`."""
-        return self.entries[self.heard.valid[0, self.entries]]
+        detected: Bool = self.heard.valid[0, self.entries]
+        return self.entries[detected]
 
     @cached_property
     def used_start(self) -> Int:
         """(P + 1,) where the detected entries of each fused row begin."""
         before: Int = np.concatenate([[0], np.cumsum(self.heard.valid[0, self.entries])])
-        return before[self.start]
+        starts: Int = before[self.start]
+        return starts
 
     def listed(self, frame: int) -> list[int]:
         """Rows of `fused` that are in one list."""
