@@ -79,19 +79,28 @@ def write_rrd(
     strict = rr.strict_mode()
     rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
     try:
+        with rr.RecordingStream(f"copem_replay:{layout}", recording_id=identity, send_properties=False) as rec:
+            if not rr.is_enabled(rec):
+                raise OutputError(f"{path}: not written, Rerun is switched off (RERUN=off in the environment?)")
+            # Not `save`: on a full disk it waits for ever, or leaves half a file and says nothing.
+            memory = rec.memory_recording()
+            rec.send_blueprint(blueprint, make_active=False)
+            _fill(_Out(rec, replay.scene.t0_ns), replay, experiment, beliefs, table, summary, run, shown)
+        _replace(path, memory.drain_as_bytes())
+    finally:
+        rr.set_strict_mode(strict)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file that is complete under its name, or not there."""
+    try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp") as folder:
-            scratch = Path(folder) / "recording.rrd"
-            with rr.RecordingStream(f"copem_replay:{layout}", recording_id=identity, send_properties=False) as rec:
-                rec.save(scratch, default_blueprint=blueprint)
-                _fill(_Out(rec, replay.scene.t0_ns), replay, experiment, beliefs, table, summary, run, shown)
-            if not scratch.exists():
-                raise OutputError(f"{path}: Rerun wrote nothing; is RERUN=off in the environment?")
+            scratch = Path(folder) / path.name
+            scratch.write_bytes(content)
             os.replace(scratch, path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        rr.set_strict_mode(strict)
 
 
 @dataclass(frozen=True)
@@ -141,10 +150,8 @@ def _fill(
         _covariance(out, ["world", part, "covariance"], beliefs[name], colour)
         _position_errors(out, replay, experiment, name, beliefs[name], shown, colour)
         _events(out, ["events", part], name, table[table["configuration"] == name])
-    title = (
-        f"## {scene.log}: run {run}\n\nSeed {experiment.seed}, visibility `{experiment.visibility}`. The views show "
-    )
-    text = f"{title}this run, the table is over all runs and logs.\n\n{_markdown(summary)}"
+    what = f"Run {run} of {scene.log}, seed {experiment.seed}, visibility `{experiment.visibility}`"
+    text = f"{what}. The table is over all runs and logs.\n\n{_markdown(summary)}"
     out.static(["summary"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
@@ -300,34 +307,39 @@ def _covariance(out: _Out, path: list[str], tracks: Tracks, colour: Rgb) -> None
 def _visible_shares(out: _Out, replay: Replay, experiment: Experiment, shown: Sequence[int]) -> None:
     import rerun as rr
 
-    scene, tracks, max_gap_ns = replay.scene, replay.measured.tracks, experiment.max_gap_s * 1e9
-    stamps = np.unique(tracks.stamp_ns)
-    newest = np.full((len(tracks.units), len(stamps)), -1)  # each unit's newest list at each instant
-    for unit in range(len(tracks.units)):
-        mine = np.flatnonzero(tracks.frame_unit_ix == unit)
-        at = np.searchsorted(tracks.stamp_ns[mine], stamps, side="right") - 1
-        known = at >= 0
-        known[known] = (stamps[known] - tracks.stamp_ns[mine[at[known]]]) <= max_gap_ns
-        newest[unit, known] = mine[at[known]]
+    scene, tracks = replay.scene, replay.measured.tracks
+    stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([carrier(scene, unit) for unit in experiment.units.values()], dtype=np.int64)
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
-    styles = (("ego", own, _EGO_RGB, 3.0), ("any unit", np.ones_like(own), TRUTH, 1.5))
+    styles = [("ego", own, _EGO_RGB, 3.0)] if own.any() else []
+    styles += [("any unit", np.ones_like(own), TRUTH, 1.5)] if len(own) else []
     for k in shown:
         share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
         rows = np.flatnonzero(tracks.row_object_ix == k)
         share[tracks.frame_ix[rows]] = replay.measured.look.visible_share[rows]
         for name, units, colour, width in styles:
-            if units.any():
-                # A unit without a list of the object says nothing about it: the best of the others counts.
-                best = np.fmax.reduce(share[newest[units]], axis=0)
-                lines = rr.SeriesLines(names=name, colors=colour, widths=width)
-                path = ["plots", "visible_share", scene.object_ids[k], name]
-                known = ~np.isnan(best)
-                # An empty row breaks the line (NaN would, too, but no two recordings with NaN compare equal).
-                kept = known | np.append(False, known[:-1])
-                values = rr.Scalars.columns(scalars=best[known]).partition(known[kept].astype(np.int64))
-                out.columns(path, (stamps - scene.t0_ns)[kept], values)
-                out.static(path, lines)
+            # A unit without a list of the object says nothing about it: the best of the others counts.
+            best = np.fmax.reduce(share[newest[units]], axis=0)
+            known = ~np.isnan(best)
+            # An empty row breaks the line. NaN would, too, but no two recordings with NaN compare equal.
+            kept = known | np.append(False, known[:-1])
+            values = rr.Scalars.columns(scalars=best[known]).partition(known[kept].astype(np.int64))
+            path = ["plots", "visible_share", scene.object_ids[k], name]
+            out.columns(path, (stamps - scene.t0_ns)[kept], values)
+            out.static(path, rr.SeriesLines(names=name, colors=colour, widths=width))
+
+
+def _newest_lists(tracks: Tracks, max_gap_s: float) -> tuple[Int, Int]:
+    """All capture instants (K,), and the newest list of each unit at each (U, K): −1, none for `max_gap_s`."""
+    stamps = np.unique(tracks.stamp_ns)
+    newest = np.full((len(tracks.units), len(stamps)), -1)
+    for unit in range(len(tracks.units)):
+        mine = np.flatnonzero(tracks.frame_unit_ix == unit)  # in order of capture
+        at = np.searchsorted(tracks.stamp_ns[mine], stamps, side="right") - 1
+        known = at >= 0
+        known[known] = stamps[known] - tracks.stamp_ns[mine[at[known]]] <= max_gap_s * 1e9
+        newest[unit, known] = mine[at[known]]
+    return stamps, newest
 
 
 def _position_errors(
@@ -350,30 +362,34 @@ def _position_errors(
         out.static(path, style)
 
 
+_ENDINGS = {
+    "object_left": "left undetected",
+    "ego_left": "undetected when the ego left",
+    "log_end": "undetected when the log ended",
+}
+
+
 def _events(out: _Out, path: list[str], name: str, part: pd.DataFrame) -> None:
     """Onset of each object, and how its look ended. `part`: the rows of one configuration."""
     import rerun as rr
 
-    who = part["object_id"].astype(str) + " " + part["object_class"].astype(str)
-    seen, lost = part["detected"].to_numpy(dtype=bool), ~part["detected"].to_numpy(dtype=bool)
-    at_start = np.where(part["onset_at_start"], ", already at its first frame", "")
-    late = part["time_to_detection_s"]
-    when = late.abs().map("{:.2f} s ".format) + np.where(late < 0, "before", "after") + " the onset"
-    far = part["distance_at_detection_m"].map(", at {:.1f} m".format).mask(part["distance_at_detection_m"].isna(), "")
-    endings = {
-        "object_left": " left undetected",
-        "ego_left": " undetected when the ego left",
-        "log_end": " undetected when the log ended",
-    }
-    found = who + " detected by " + part["first_unit"].astype(str) + " " + when + far
-    text = f"{name}: " + pd.concat(
-        ["onset of " + who + at_start, found[seen], (who + part["ended_by"].map(endings))[lost]]
-    )
-    time_s = np.concatenate([part["onset_s"], part["detection_s"][seen], part["ended_s"][lost]]).astype(float)
-    level = np.repeat(["INFO", "INFO", "WARN"], [len(part), seen.sum(), lost.sum()])
-    order = np.argsort(time_s, kind="stable")
-    columns = rr.TextLog.columns(text=text.to_numpy(dtype=object)[order].tolist(), level=level[order].tolist())
-    out.columns(path, _ns(time_s[order]), columns)
+    told = sorted((event for look in part.itertuples() for event in _story(look)), key=lambda event: event[0])
+    text = [f"{name}: {sentence}" for _, _, sentence in told]
+    columns = rr.TextLog.columns(text=text, level=[level for _, level, _ in told])
+    out.columns(path, _ns([time_s for time_s, _, _ in told]), columns)
+
+
+def _story(look: Any) -> list[tuple[float, str, str]]:
+    """When, how serious, what: of one row of the detections."""
+    who = f"{look.object_id} {look.object_class}"
+    first = ", already at its first frame" if look.onset_at_start else ""
+    begin = (look.onset_s, "INFO", f"onset of {who}{first}")
+    if not look.detected:
+        return [begin, (look.ended_s, "WARN", f"{who} {_ENDINGS[look.ended_by]}")]
+    late_s, far_m = look.time_to_detection_s, look.distance_at_detection_m
+    when = f"{abs(late_s):.2f} s {'before' if late_s < 0 else 'after'} the onset"
+    where = "" if np.isnan(far_m) else f", at {far_m:.1f} m"
+    return [begin, (look.detection_s, "INFO", f"{who} detected by {look.first_unit} {when}{where}")]
 
 
 def _markdown(frame: pd.DataFrame) -> str:
@@ -402,36 +418,12 @@ def _blueprint(
     scene = replay.scene
     eye, target = _eye(replay, table)
     controls = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0, 0, 1))
-    views = [
-        rrb.Spatial3DView(
-            origin="world",
-            name=name,
-            contents=["+ world/truth/**", "+ world/static", "+ world/units/**", f"+ {_path('world', _part(name))}/**"],
-            eye_controls=controls,
-            line_grid=rrb.LineGrid3D(spacing=5.0),
-        )
-        for name in configurations[:SHOWN_CONFIGURATIONS]
-    ]
-    plots = [
-        rrb.Horizontal(
-            rrb.TimeSeriesView(
-                origin=_path("plots", "visible_share", scene.object_ids[k]),
-                name="Visible share",
-                axis_y=rrb.ScalarAxis(range=(-0.02, 1.02)),
-            ),
-            rrb.TimeSeriesView(origin=_path("plots", "position_error", scene.object_ids[k]), name="Position error [m]"),
-            name=f"{scene.object_ids[k]} {CLASSES[scene.object_class[k]]}",
-        )
-        for k in shown
-    ]
-    kinds = [rrb.encodings.TextLogColumn(kind) for kind in ("LogLevel", "Body")]
-    words = rrb.Tabs(
-        rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=kinds)),
-        rrb.TextDocumentView(origin="summary", name="Summary"),
-    )
-    below = [rrb.Tabs(*plots, name="Objects"), words] if plots else [words]
+    views = [_view(name, controls) for name in configurations[:SHOWN_CONFIGURATIONS]]
+    plots = [_plots(scene, k) for k in shown]
+    below = [rrb.Tabs(*plots, name="Objects"), _words()] if plots else [_words()]
     onset_ns = int(_ns(table["onset_s"].min())) if len(table) else 0
-    end_ns = max(replay.scene.end_ns - replay.scene.t0_ns, onset_ns)
+    end_ns = max(scene.end_ns - scene.t0_ns, onset_ns)
+    # No blueprint can place the time cursor, but playing begins where the selection does: at the first onset.
     panel = rrb.TimePanel(
         timeline=ELAPSED,
         play_state="paused",
@@ -441,7 +433,7 @@ def _blueprint(
     )
     blueprint = rrb.Blueprint(
         rrb.Vertical(
-            rrb.Grid(*views, grid_columns=3 if len(views) in (3, 5, 6) else 2 if len(views) > 1 else 1),
+            rrb.Grid(*views, grid_columns=3 if len(views) in (3, 5, 6) else min(len(views), 2)),
             rrb.Horizontal(*below, column_shares=[3, 2] if plots else None),
             row_shares=[2, 1],
         ),
@@ -455,8 +447,45 @@ def _blueprint(
     return blueprint, _digest(repr(parts))
 
 
+def _view(configuration: str, eye: rrb.EyeControls3D) -> rrb.Spatial3DView:
+    import rerun.blueprint as rrb
+
+    own = _path("world", _part(configuration))
+    return rrb.Spatial3DView(
+        origin="world",
+        name=configuration,
+        contents=["+ world/truth/**", "+ world/static", "+ world/units/**", f"+ {own}/**"],
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(spacing=5.0),
+    )
+
+
+def _plots(scene: Scene, k: int) -> rrb.Horizontal:
+    """Of one object."""
+    import rerun.blueprint as rrb
+
+    name = scene.object_ids[k]
+    shares, errors = _path("plots", "visible_share", name), _path("plots", "position_error", name)
+    return rrb.Horizontal(
+        rrb.TimeSeriesView(origin=shares, name="Visible share", axis_y=rrb.ScalarAxis(range=(-0.02, 1.02))),
+        rrb.TimeSeriesView(origin=errors, name="Position error [m]"),
+        name=f"{name} {CLASSES[scene.object_class[k]]}",
+    )
+
+
+def _words() -> rrb.Tabs:
+    import rerun.blueprint as rrb
+
+    # The text names the configuration: the column of entity paths would be cut off.
+    columns = [rrb.encodings.TextLogColumn(kind) for kind in ("LogLevel", "Body")]
+    return rrb.Tabs(
+        rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=columns)),
+        rrb.TextDocumentView(origin="summary", name="Summary"),
+    )
+
+
 def _eye(replay: Replay, table: pd.DataFrame) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Where from and where to: from behind the ego and above, on it and the first object, from its onset to detection."""
+    """Where from and where to: from behind the ego and above, on it and the first object until that is detected."""
     truth, scene = replay.truth, replay.scene
     rows = np.zeros(len(truth.frame_ix), dtype=bool)
     if len(table):
