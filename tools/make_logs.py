@@ -93,9 +93,7 @@ def moving_object(body: Body, time_s: float) -> MovingObject:
     osi.base.velocity.x, osi.base.velocity.y, osi.base.velocity.z = *velocity_mps, 0.0
     if body.vehicle:
         osi.vehicle_classification.type = body.vehicle
-        rear = (
-            osi.vehicle_attributes.bbcenter_to_rear
-        )  # chosen: 0.3 of the length behind the centre, 0.3 m up
+        rear = osi.vehicle_attributes.bbcenter_to_rear  # chosen: 0.3 of the length behind the centre, 0.3 m up
         rear.x, rear.y, rear.z = -0.3 * body.size_m[0], 0.0, 0.3 - body.size_m[2] / 2
     return osi
 
@@ -184,7 +182,9 @@ def tc016d() -> Recording:
 
 def recipes() -> dict[str, Callable[[], Recording]]:
     """Return every recording by the name of its file; recipes of other modules are imported in here."""
-    return {"tc016d": tc016d}
+    from crossing import crossing
+
+    return {"tc016d": tc016d, "crossing": crossing}
 
 
 # Writing ----------------------------------------------------------------------------------------------------
