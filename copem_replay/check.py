@@ -6,28 +6,41 @@ References are checked on the file's plain data, so that a typo elsewhere does n
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from copem_replay.errors import RecordingError
 from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import Key, Source, log_paths, parse
-from copem_replay.read import Recording, read
-from copem_replay.tracks import CLASSES, Scene
+from copem_replay.experiment_file import Source, is_there, log_paths, parse
+from copem_replay.plain_yaml import Key
+from copem_replay.read import Recording, moving_ids, read
 
 NO_EGO = "none"
 """`ego: none`: no ego in this study."""
 
 
+@dataclass(frozen=True)
+class Refused:
+    """A log that cannot be replayed, and why. `key`: what the experiment asks of it in vain."""
+
+    path: Path
+    reason: str
+    key: Key | None = None
+
+    def said(self, source: Source | None) -> str:
+        """The reason as a line: where it is, and what is wrong."""
+        line = f"{self.path}: {self.reason}"
+        return line if self.key is None or source is None else source.at(self.key, line)
+
+
 def problems(source: Source) -> tuple[Experiment | None, list[str]]:
-    """The experiment, or None where its shape is wrong, and all problems that can be seen without the logs' content."""
+    """The experiment, or None where its shape is wrong, and all problems that show without a look at the logs."""
     experiment, found = parse(source)
     found += references(source)
-    paths, missing = log_paths(source)
-    found += missing
-    found += [f"{source.path}: logs: {path}: no such file" for path in paths if not path.exists()]
+    found += log_paths(source)[1]
     return experiment, sorted(found, key=lambda line: _line_number(line, source.path))
 
 
@@ -37,38 +50,43 @@ def _line_number(problem: str, path: Path) -> int:
 
 
 def references(source: Source) -> Iterator[str]:
-    """Names that nothing bears: PEMs, units, ids of units in latencies and in `distance_to`."""
+    """Names that nothing bears: PEMs, units, ids of units in latencies and in `distance_to`; a run that is not made."""
     data = source.data
     pems, units = _names(data.get("pems")), _names(data.get("units"))
     for name, unit in _items(data.get("units")):
         pem = unit.get("pem")
-        if isinstance(pem, str | int) and str(pem) not in pems:
+        if _is_name(pem) and str(pem) not in pems:
             yield source.at(("units", name, "pem"), _unknown("PEM", pem, pems))
     for name, configuration in _items(data.get("configurations")):
         yield from _configuration(source, ("configurations", name), configuration, units)
     measure = data.get("measure")
     if isinstance(measure, dict):
-        place = str(measure.get("distance_to", "ego"))
-        if place != "ego" and place not in units:
+        place = measure.get("distance_to", "ego")
+        if _is_name(place) and place != "ego" and str(place) not in units:
             yield source.at(("measure", "distance_to"), _unknown("unit", place, ["ego", *units]))
         onset = measure.get("onset")
         if isinstance(onset, dict) and onset.get("kind") == "line_of_sight_any" and not units:
             yield source.at(("measure", "onset"), "line_of_sight_any: there is no unit to see anything")
+    show, runs = data.get("show"), data.get("runs", 1)
+    run = show.get("run") if isinstance(show, dict) else None
+    if isinstance(run, int) and isinstance(runs, int) and 1 <= runs <= run:
+        yield source.at(("show", "run"), f"expected a run below {runs}, found {run}")
 
 
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
     chosen = configuration.get("units")
     if chosen == "all" and not units:
         yield source.at((*key, "units"), "all: the experiment has no units")
-    named = chosen if isinstance(chosen, list) else []
-    for k, unit in enumerate(named):
-        if isinstance(unit, str | int) and str(unit) not in units:
+    given: list[str] = []
+    for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
+        if _is_name(unit) and str(unit) not in units:
             yield source.at((*key, "units", k), _unknown("unit", unit, units))
-        elif unit in named[:k]:
-            yield source.at((*key, "units", k), f"unit {unit!r} named twice")
+        elif str(unit) in given:
+            yield source.at((*key, "units", k), f"unit {str(unit)!r} named twice")
+        given.append(str(unit))
     latency = configuration.get("latency_s")
     for unit in latency if isinstance(latency, dict) else ():
-        if str(unit) not in [*units, "default", "truth"]:
+        if unit not in [*units, "default", "truth"]:
             yield source.at((*key, "latency_s", unit), _unknown("unit", unit, [*units, "default"]))
 
 
@@ -82,80 +100,109 @@ def _names(mapping: object) -> list[str]:
     return [str(name) for name in mapping] if isinstance(mapping, dict) else []
 
 
-def _unknown(what: str, name: object, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(name), known, n=1)
-    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(known) if known else 'are none'}"
+def _is_name(value: object) -> bool:
+    return isinstance(value, str | int) and not isinstance(value, bool)
+
+
+def _unknown(what: str, name: object, known: Iterable[str]) -> str:
+    names = list(dict.fromkeys(known))
+    near = difflib.get_close_matches(str(name), names, n=1)
+    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"
     return f"no {what} is named {str(name)!r}{hint}"
+
+
+def place_of(path: Path) -> Path:
+    """Where a file is, whatever led there; its own name is kept, even if it is a link's."""
+    return Path(os.path.realpath(path.parent)) / path.name
 
 
 def log_names(paths: Sequence[Path]) -> list[str]:
     """A name per log: its file name, made unique by its folder where two are alike."""
+    whole = [place_of(path).relative_to("/") for path in paths]
+    bare = [path.with_suffix("") for path in whole]
+    bare = [short if bare.count(short) == 1 else path for short, path in zip(bare, whole, strict=True)]
     depth = [1] * len(paths)
     while True:
-        names = ["/".join([*p.resolve().parts[-d:-1], p.stem]) for p, d in zip(paths, depth, strict=True)]
-        again = [names.count(n) > 1 and depth[k] < len(paths[k].resolve().parts) for k, n in enumerate(names)]
+        names = ["/".join(path.parts[-d:]) for path, d in zip(bare, depth, strict=True)]
+        again = [names.count(name) > 1 and d < len(p.parts) for name, p, d in zip(names, bare, depth, strict=True)]
         if not any(again):
             return names
         depth = [d + twice for d, twice in zip(depth, again, strict=True)]
 
 
 def read_logs(
-    experiment: Experiment, paths: Iterable[Path], source: Source | None
-) -> tuple[list[Recording], list[tuple[Path, str]]]:
-    """The recordings that can be replayed, and those that cannot with the reason, one line per problem."""
-    unique = list(dict.fromkeys(paths))
-    recordings: list[Recording] = []
-    refused: list[tuple[Path, str]] = []
-    for path, name in zip(unique, log_names(unique), strict=True):
-        try:
-            recording = read(
-                path,
-                name=name,
-                ego=None if experiment.ego in (None, NO_EGO) else experiment.ego,
-                topic=experiment.read.topic,
-            )
-        except RecordingError as error:
-            refused += [(path, line) for line in error.problems]
-            continue
-        if experiment.ego == NO_EGO:
-            recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
-        wrong = list(against_log(experiment, recording, source))
-        refused += [(path, line) for line in wrong]
-        if not wrong:
-            recordings.append(recording)
-    return recordings, refused
+    experiment: Experiment, paths: Mapping[Path, Key | None] | Iterable[Path], source: Source | None
+) -> tuple[list[Recording], list[Refused]]:
+    """The recordings that can be replayed, and what is wrong with those that cannot.
+
+    `paths`: with where the experiment names each. A file that is named twice is read once.
+    """
+    keys = paths if isinstance(paths, Mapping) else dict.fromkeys(paths)
+    recordings: dict[str, Recording] = {}
+    refused: list[Refused] = []
+    for path, key in keys.items():
+        if not is_there(path):
+            refused.append(Refused(path, "no such file", key))
+        elif (place := os.path.realpath(path)) not in recordings:
+            recording, wrong = _read(experiment, path)
+            refused += wrong
+            if recording is not None and not wrong:
+                recordings[place] = recording
+    # Named when it is known which there are: the experiment that is written with the results names only these.
+    names = log_names([recording.path for recording in recordings.values()])
+    return [replace(r, scene=replace(r.scene, log=n)) for r, n in zip(recordings.values(), names, strict=True)], refused
 
 
-def against_log(experiment: Experiment, recording: Recording, source: Source | None) -> Iterator[str]:
-    """Problems of an experiment with one log: an ego that is missing, carriers that are not in it."""
+def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Refused]]:
+    try:
+        str(place_of(path)).encode()
+    except UnicodeEncodeError:
+        return None, [Refused(path, "its path is not UTF-8: results could not name it")]
+    ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
+    wrong: list[Refused] = []
+    try:
+        recording = read(path, name=path.stem, ego=ego, topic=experiment.read.topic)
+    except RecordingError as error:
+        reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
+        if not reasons[0].startswith("ego: "):
+            key = ("read", "topic") if "no true objects on topic" in reasons[0] else None
+            return None, [Refused(path, reason, key) for reason in reasons]
+        wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
+        recording = read(path, name=path.stem, topic=experiment.read.topic)  # for what else is wrong
+    if experiment.ego == NO_EGO:
+        recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
+    return recording, wrong + [Refused(path, reason, key) for key, reason in against_log(experiment, recording, wrong)]
 
-    def at(key: Key, message: str) -> str:
-        return source.at(key, f"{recording.path}: {message}") if source else f"{recording.path}: {message}"
 
+def against_log(
+    experiment: Experiment, recording: Recording, known: Sequence[Refused] = ()
+) -> Iterator[tuple[Key, str]]:
+    """Problems of an experiment with one log, beside `known` ones: no ego, carriers that are not in it."""
     scene = recording.scene
     none = scene.ego_ix < 0
     if none and experiment.ego is None:
-        yield at(
+        yield (
             ("ego",),
             f"no ego vehicle in this log{_host(recording)}; give `ego: <object id>` or --ego ID "
-            f"({_some_objects(scene)}), or `ego: none` with `distance_to: <unit>`",
+            f"({moving_ids(scene)}), or `ego: none` with `distance_to: <unit>`",
         )
-        return
-    if none and experiment.measure.distance_to == "ego":
-        yield at(("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from")
+    studied = not none or experiment.ego != NO_EGO  # an ego that is sought and not there is said once
+    if not studied and experiment.measure.distance_to == "ego":
+        yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"
     for name, unit in experiment.units.items():
         if unit.on == "ego":
-            if none:
-                yield at(("units", name, "on"), "no ego in this study to carry the unit")
+            if not studied:
+                yield ("units", name, "on"), "no ego in this study to carry the unit"
         elif unit.on is not None and unit.on not in scene.object_number:
-            yield at(("units", name, "on"), f"no object {unit.on!r} in the log; it has {_some_objects(scene)}")
-    onset = experiment.measure.onset
-    if onset.kind == "line_of_sight" and not none:
+            yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
+    if experiment.measure.onset.kind != "line_of_sight" or known:
+        return
+    if not studied:
+        yield ("measure", "onset"), "line_of_sight is the ego's; without an ego use line_of_sight_any"
+    elif not none:
         on_ego = ("ego", scene.object_ids[scene.ego_ix])
         if not any(unit.on in on_ego for unit in experiment.units.values()):
-            yield at(("measure", "onset"), "line_of_sight needs a unit on the ego; or use line_of_sight_any")
-    if onset.kind == "line_of_sight" and none:
-        yield at(("measure", "onset"), "line_of_sight is the ego's; without an ego use line_of_sight_any")
+            yield ("measure", "onset"), "line_of_sight needs a unit on the ego; or use line_of_sight_any"
 
 
 def across_logs(experiment: Experiment, recordings: Sequence[Recording], source: Source | None) -> Iterator[str]:
@@ -164,25 +211,21 @@ def across_logs(experiment: Experiment, recordings: Sequence[Recording], source:
     def at(key: Key, message: str) -> str:
         return source.at(key, message) if source else message
 
-    for k, wanted in enumerate(experiment.measure.objects.ids or ()):
-        if recordings and not any(wanted in r.scene.object_number for r in recordings):
-            known = _some_objects(recordings[0].scene)
-            yield at(("measure", "objects", "ids", k), f"no object {wanted!r} in any log; the first has {known}")
-    names = [r.scene.log for r in recordings]
+    scenes = [recording.scene for recording in recordings]
+    for k, wanted in enumerate(experiment.measure.objects.ids or () if scenes else ()):
+        key = ("measure", "objects", "ids", k)
+        there = [scene for scene in scenes if wanted in scene.object_number]
+        if not there:
+            yield at(key, f"no object {wanted!r} in any log; the first has {moving_ids(scenes[0])}")
+        elif all(scene.object_number[wanted] == scene.ego_ix for scene in there):
+            yield at(key, f"{wanted!r} is the ego vehicle, which is not measured")
+    names = [scene.log for scene in scenes]
     for k, wanted in enumerate(experiment.show.logs if experiment.show else ()):
         if names and wanted not in ("first", "all", *names):
             yield at(("show", "logs", k), _unknown("log", wanted, ["first", "all", *names]))
-    if experiment.show and isinstance(experiment.show.run, int) and experiment.show.run >= experiment.runs:
-        yield at(("show", "run"), f"expected a run below {experiment.runs}, found {experiment.show.run}")
 
 
 def _host(recording: Recording) -> str:
     if recording.host_id is None:
         return " (host_vehicle_id is not set)"
-    return f" (its host_vehicle_id {recording.host_id!r} is no object of it)"
-
-
-def _some_objects(scene: Scene, most: int = 12) -> str:
-    moving = [k for k in range(len(scene.object_ids)) if scene.moving[k]]
-    text = ", ".join(f"{scene.object_ids[k]} ({CLASSES[scene.object_class[k]]})" for k in moving[:most])
-    return text + (f", … {len(moving)} in all" if len(moving) > most else "")
+    return f" (its host_vehicle_id {recording.host_id!r} is no moving object of it)"

@@ -5,9 +5,14 @@
 
 from __future__ import annotations
 
+import io
+import os
+import signal
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+import unicodedata
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +23,6 @@ from copem_replay.errors import CopemError, InputError, OutputError
 app = typer.Typer(
     help="Replay recorded traffic through perception error models of one or many cooperating units.",
     add_completion=False,
-    no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -29,6 +33,7 @@ ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Expe
 
 @app.callback(invoke_without_command=True)
 def version(
+    context: typer.Context,
     show: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
 ) -> None:
     """Print the version."""
@@ -37,6 +42,9 @@ def version(
 
         print(f"copem-replay {installed('copem-replay')}")
         raise typer.Exit(0)
+    if context.invoked_subcommand is None:
+        commands = ", ".join(command.callback.__name__ for command in app.registered_commands if command.callback)
+        raise InputError(f"copem-replay: expected a command, one of {commands}; --help tells more")
 
 
 @app.command()
@@ -49,25 +57,20 @@ def info(
 
     from copem_replay.info import describe, survey
 
-    surveys = [_or_problem(survey, log) for log in logs]
-    good = [s for s in surveys if isinstance(s, dict)]
+    surveys = [survey(log) for log in logs]
     if as_json:
-        print(json.dumps(good, indent=1, ensure_ascii=False))
+        print(json.dumps(surveys, indent=1, ensure_ascii=False))
     else:
-        print("\n\n".join("\n".join(describe(s)) for s in good))
-    problems = [line for s in surveys if not isinstance(s, dict) for line in s]
-    problems += [str(s["reason"]) for s in good if not s["readable"]]
-    if problems:
-        raise InputError(problems)
-    return 0
+        _print_blocks(describe(s) for s in surveys if s["topics"])
+    _complain(s["reason"] for s in surveys if not s["readable"])
+    return 0 if any(s["readable"] for s in surveys) else 2
 
 
 @app.command()
 def check(experiment: ExperimentFile) -> int:
     """Every problem of an experiment file at once, with file and line, against its logs too."""
-    _experiment, recordings, _skipped = _load(experiment, {}, [], skip_unreadable=False)
-    names = ", ".join(r.scene.log for r in recordings)
-    print(f"{experiment}: no problem found; logs: {names}")
+    _experiment, recordings, _skipped = _ready(_source(experiment, {}, []), skip_unreadable=False)
+    print(_printable(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in recordings)}"))
     return 0
 
 
@@ -79,7 +82,7 @@ def run(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Results folder [out/<experiment>].")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Number of runs.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Workers [one per core].")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=1024, help="Workers [one per core].")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results that are there.")] = False,
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Leave out logs that cannot be replayed.")
@@ -89,19 +92,19 @@ def run(
     from copem_replay.results import check_target, write_results
     from copem_replay.table import summary_text
 
+    changes = {"ego": ego, "runs": runs, "seed": seed}
+    source = _source(experiment, {k: v for k, v in changes.items() if v is not None}, log or [])
     folder = out or Path("out") / experiment.stem
     check_target(folder, overwrite=overwrite)
-    changes = {"ego": ego, "runs": runs, "seed": seed}
-    ready, recordings, skipped = _load(
-        experiment, {k: v for k, v in changes.items() if v is not None}, log or [], skip_unreadable=skip_unreadable
-    )
+    ready, recordings, skipped = _ready(source, skip_unreadable=skip_unreadable)
+    check_target(folder, overwrite=overwrite, inputs=[experiment, *(recording.path for recording in recordings)])
     from copem_replay.run import run as run_experiment
 
     result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
     notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite)
-    _say([f"{path}: skipped: {reason}" for path, reason in skipped] + notes)
+    _complain([f"note: {path}: skipped: {reason}" for path, reason in skipped] + [f"note: {note}" for note in notes])
     print(summary_text(result.summary))
-    print(f"results in {folder}")
+    print(_printable(f"results in {folder}"))
     return 1 if skipped else 0
 
 
@@ -110,7 +113,10 @@ def view(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results fol
     """Open the recordings of a results folder in the Rerun viewer."""
     import subprocess
 
-    files = [p for p in [folder / "replay.rrd", *sorted(folder.glob("replay/**/*.rrd"))] if p.is_file()]
+    place = folder.absolute()  # no name that looks like an option
+    files = [p for p in [place / "replay.rrd", *sorted(place.glob("replay/**/*.rrd"))] if p.is_file()]
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
     if not files:
         raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
     # The module, not the script: it is there in every environment that has rerun-sdk, whatever the PATH.
@@ -134,39 +140,46 @@ def schema() -> int:
     return 0
 
 
-def _load(
-    path: Path, changes: dict[str, Any], logs: Sequence[Path], *, skip_unreadable: bool
-) -> tuple[Any, Any, list[tuple[Path, str]]]:
-    """Experiment and recordings; raises with every problem there is."""
-    from copem_replay.check import across_logs, problems, read_logs
-    from copem_replay.experiment_file import load, log_paths
+def _source(path: Path, changes: dict[str, Any], logs: Sequence[Path]) -> Any:
+    """The experiment file, with what the options say instead."""
+    from dataclasses import replace
+
+    from copem_replay.experiment_file import load
 
     source = load(path)
     source.data.update(changes)
-    if logs:
-        source.data["logs"] = [str(log.absolute()) for log in logs]
+    if not logs:
+        return source
+    source.data["logs"] = [str(log) for log in logs]
+    return replace(source, logs=tuple(map(str, logs)))
+
+
+def _ready(source: Any, *, skip_unreadable: bool) -> tuple[Any, Any, list[tuple[Path, str]]]:
+    """Experiment and recordings, and what was skipped; raises with every problem there is."""
+    from copem_replay.check import across_logs, problems, read_logs
+    from copem_replay.experiment_file import log_paths
+
     experiment, found = problems(source)
-    paths, _ = log_paths(source)
-    if skip_unreadable:
-        found = [line for line in found if not line.endswith(": no such file")]
-    if experiment is None or found:
+    if experiment is None:
         raise InputError(found)
-    recordings, refused = read_logs(experiment, paths, source)
-    wrong = list(across_logs(experiment, recordings, source))
-    if wrong or (refused and not skip_unreadable) or not recordings:
-        raise InputError([*(reason for _, reason in refused), *wrong])
-    return experiment, recordings, refused
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source)
+    if not skip_unreadable or not recordings:
+        found += [log.said(source) for log in refused]
+    found += across_logs(experiment, recordings, source)
+    if found:
+        raise InputError(found)
+    return experiment, recordings, [(log.path, log.reason) for log in refused]
 
 
 def _workers(jobs: int | None) -> int:
-    import os
-
-    return jobs or len(os.sched_getaffinity(0))
+    if jobs is not None:
+        return jobs
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _with_progress(work: Callable[[Callable[[int, int], None] | None], Any]) -> Any:
     """Show a bar on a terminal, nothing otherwise."""
-    if not sys.stderr.isatty():
+    if sys.stderr is None or not sys.stderr.isatty():
         return work(None)
     from rich.console import Console
     from rich.progress import Progress
@@ -176,44 +189,76 @@ def _with_progress(work: Callable[[Callable[[int, int], None] | None], Any]) -> 
         return work(lambda done, total: bar.update(task, completed=done, total=total))
 
 
-def _or_problem(work: Callable[[Path], Any], path: Path) -> Any:
-    try:
-        return work(path)
-    except CopemError as error:
-        return error.problems
+def _printable(text: str) -> str:
+    """One line that no file name or key can break, colour or stop."""
+    harmful = {c for c in text if unicodedata.category(c)[0] == "C" or c in "\u2028\u2029"}
+    return "".join(c.encode("unicode_escape").decode() if c in harmful else c for c in text)
 
 
-def _say(lines: Sequence[str]) -> None:
+def _print_blocks(blocks: Iterable[Sequence[str]]) -> None:
+    print("\n\n".join("\n".join(map(_printable, block)) for block in blocks))
+
+
+def _complain(lines: Iterable[str]) -> None:
     for line in lines:
-        print(f"note: {line}", file=sys.stderr)
+        print(_printable(line), file=sys.stderr)
 
 
 def main() -> None:
     """Entry point: runs a command and ends with its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that has no “×” gets `\\xd7`
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # by way of what has to be tidied up
     sys.exit(_ended())
 
 
 def _ended() -> int:
     try:
-        code = app(standalone_mode=False)
+        code = _called(sys.argv[1:])
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
     except CopemError as error:
-        for line in error.problems:
-            print(line, file=sys.stderr)
+        _complain(error.problems)
         return 2
     except (KeyboardInterrupt, typer.Abort):
-        print("interrupted: nothing was written", file=sys.stderr)
+        _complain(["interrupted"])
         return 130
     except BrokenPipeError:  # the reader of our output has gone: `copem-replay info … | head`
-        sys.stdout = None
+        _discard_output()
         return 0
+    except MemoryError:
+        _complain(["copem-replay: not enough memory; take fewer runs, units or objects at a time"])
+        return 2
     except Exception as error:
         if hasattr(error, "format_message"):  # typer's words on options and arguments
-            print(f"copem-replay: {' '.join(error.format_message().split())}", file=sys.stderr)
+            _complain([f"copem-replay: {' '.join(error.format_message().split())}"])
+            return 2
+        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | FileExistsError):
+            _discard_output()  # a full disk, a device that fails, no permission: none of our doing
+            _complain([f"copem-replay: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"])
             return 2
         traceback.print_exc()
         print("copem-replay: this is a defect of copem_replay; please report it with the lines above", file=sys.stderr)
         return 70
+
+
+def _called(arguments: list[str]) -> int:
+    """Run a command. Not by typer's own `main`, which has other ideas of what errors and interrupts look like."""
+    command = typer.main.get_command(app)
+    try:
+        with command.make_context("copem-replay", arguments) as context:
+            code = command.invoke(context)
+    except typer.Exit as ended:
+        return ended.exit_code
     return code if isinstance(code, int) else 0
+
+
+def _discard_output() -> None:
+    """What is still to be printed goes nowhere: nobody reads it, or it cannot be written."""
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from copy import deepcopy
 from importlib.metadata import entry_points
 from typing import Annotated, Any
 
@@ -34,12 +35,16 @@ class Component(Frozen):
     kind: str
 
 
-Number = Annotated[float, Field(strict=True)]
+_LARGEST = 1e12
+"""Chosen: no quantity of an experiment is larger, and products of two such numbers are still numbers."""
+Number = Annotated[float, Field(strict=True, ge=-_LARGEST, le=_LARGEST)]
 """A number; text and true/false are refused."""
-Positive = Annotated[float, Field(strict=True, gt=0)]
-NotNegative = Annotated[float, Field(strict=True, ge=0)]
+Positive = Annotated[float, Field(strict=True, gt=0, le=_LARGEST)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, le=_LARGEST)]
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
-Count = Annotated[int, Field(strict=True, ge=1)]
+Count = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Flag = Annotated[bool, Field(strict=True)]
+"""True or false; `yes` is text."""
 
 
 class Slot:
@@ -51,9 +56,11 @@ class Slot:
     def __init__(self, name: str, built_in: Mapping[str, str]) -> None:
         self.name = name
         self.built_in = dict(built_in)
+        self.base: type[Any] = Component
 
     def __get_pydantic_core_schema__(self, source: type[Any], handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         """Validation: find the class that `kind` names and let it validate the rest."""
+        self.base = source
         return core_schema.no_info_plain_validator_function(
             self.build,
             serialization=core_schema.plain_serializer_function_ser_schema(
@@ -67,10 +74,14 @@ class Slot:
         """JSON Schema: one alternative per installed component, and one for `package.module:Class`."""
         alternatives = []
         for kind in self.kinds():
-            described = self.find(kind).model_json_schema()
-            described["properties"]["kind"] = {"const": kind}
-            described["required"] = sorted({*described.get("required", []), "kind"})
-            alternatives.append(described)
+            try:
+                component = self.find(kind)
+            except PydanticCustomError:  # an entry point of another package that is broken: not to be had
+                continue
+            found = deepcopy(handler.resolve_ref_schema(handler(component.__pydantic_core_schema__)))
+            found["properties"]["kind"] = {"const": kind}
+            found["required"] = sorted({*found.get("required", []), "kind"})
+            alternatives.append(found)
         own = {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]}
         return {"anyOf": [*alternatives, own]}
 
@@ -92,10 +103,11 @@ class Slot:
         module, _, name = target.partition(":")
         try:
             component = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise _problem(f"kind: {kind!r} cannot be imported: {error}") from error
-        if not (isinstance(component, type) and issubclass(component, Component)):
-            raise _problem(f"kind: {kind!r} is not a copem_replay.Component")
+        except Exception as error:  # whatever a module of the user's raises
+            why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            raise _problem(f"kind: {kind!r} cannot be imported: {why}") from error
+        if not (isinstance(component, type) and issubclass(component, self.base)) or component is self.base:
+            raise _problem(f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}")
         return component
 
     def build(self, value: object) -> Component:
@@ -103,7 +115,8 @@ class Slot:
         if isinstance(value, Component):
             return value
         if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
-            raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {value!r}")
+            found = "nothing" if value is None else repr(value)
+            raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {found}")
         return self.find(value["kind"]).model_validate(dict(value))
 
 
@@ -112,4 +125,4 @@ def _problem(message: str) -> PydanticCustomError:
     return PydanticCustomError("component", "{message}", {"message": message})
 
 
-__all__ = ["Component", "Count", "Frozen", "NotNegative", "Number", "Positive", "Share", "Slot"]
+__all__ = ["Component", "Count", "Flag", "Frozen", "NotNegative", "Number", "Positive", "Share", "Slot"]

@@ -42,7 +42,8 @@ def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool
     not_before_s = np.full(len(found.object_ix), -np.inf) if count_earlier else found.onset_s - _TOLERANCE_S
     shape = (heard.valid.shape[0], len(found.object_ix))
     out = Detections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
-    outdated_s = np.minimum(_superseded_s(heard)[heard.frame_ix], arrives_s + max_age_s + _TOLERANCE_S)
+    # From when on a list is no longer gone by: at its greatest age, within a microsecond, it still is.
+    outdated_s = np.minimum(_superseded_s(heard)[heard.frame_ix], arrives_s + max_age_s + 2 * _TOLERANCE_S)
     _first(
         heard.valid, order, bounds, arrives_s, captured_s, outdated_s, heard.row_unit_ix,
         capture_instants(heard)[heard.frame_ix], heard.frame_ix, heard.frame_unit_ix,
@@ -55,7 +56,8 @@ def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool
 def capture_instants(heard: Tracks) -> Int:
     """(F,) the capture instant each list belongs to, counted from the first.
 
-    Captures within half the shortest list period of the first one are one instant.
+    Captures of several units within half the shortest list period of the first one are one instant; two captures of
+    one unit never are.
     """
     periods = []
     for unit in np.unique(heard.frame_unit_ix):
@@ -65,18 +67,20 @@ def capture_instants(heard: Tracks) -> Int:
     reach_s = min(periods, default=0.0) / 2 + _TOLERANCE_S
     order = np.argsort(heard.captured_s, kind="stable")
     cluster = np.zeros(len(order), dtype=np.int64)
-    _cluster(heard.captured_s[order], reach_s, order, cluster)
+    _cluster(heard.captured_s, heard.frame_unit_ix, np.full(len(heard.units), -1), reach_s, order, cluster)
     return cluster
 
 
 def _by_object(heard: Tracks, found: Looks, arrives_s: Float) -> tuple[Int, Int]:
     """Rows of each look in order of arrival, then of the units: (rows,), and where each look's begin (M + 1,)."""
-    look_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 1, -1)
+    # One place more than there are objects: index −1, no truth id, is looked at by nobody.
+    look_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
     look_of[found.object_ix] = np.arange(len(found.object_ix))
     look = look_of[heard.row_object_ix]
-    rows = np.flatnonzero(look >= 0)
+    rows = np.flatnonzero((look >= 0) & np.isfinite(arrives_s))
     # Arrivals within a microsecond are one instant: among them the experiment's order of units decides.
-    instant = np.rint(arrives_s[rows] / _TOLERANCE_S).astype(np.int64)
+    ordered = np.unique(arrives_s[rows])
+    instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > _TOLERANCE_S)[np.searchsorted(ordered, arrives_s[rows])]
     rows = rows[np.lexsort((heard.row_unit_ix[rows], instant, look[rows]))]
     return rows, np.searchsorted(look[rows], np.arange(len(found.object_ix) + 1))
 
@@ -85,18 +89,18 @@ def _superseded_s(heard: Tracks) -> Float:
     """(F,) when the next list of the same unit arrives; inf for its last."""
     result = np.full(len(heard.stamp_ns), np.inf)
     for unit in np.unique(heard.frame_unit_ix):
-        mine = np.flatnonzero(heard.frame_unit_ix == unit)
+        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(heard.arrives_s[0]))
         result[mine[:-1]] = heard.arrives_s[0, mine[1:]]
     return result
 
 
 @nb.njit(cache=True, nogil=True)
-def _cluster(captured_s: Float, reach_s: float, order: Int, out: Int) -> None:
+def _cluster(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: float, order: Int, out: Int) -> None:
     current, first = -1, -np.inf
-    for k in range(len(captured_s)):
-        if captured_s[k] > first + reach_s:
+    for k in order:
+        if captured_s[k] > first + reach_s or last_of[unit_ix[k]] == current:
             current, first = current + 1, captured_s[k]
-        out[order[k]] = current
+        out[k] = last_of[unit_ix[k]] = current
 
 
 @nb.njit(cache=True, nogil=True)

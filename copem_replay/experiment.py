@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
 
-from copem_replay.components import Count, Frozen, NotNegative, Number, Positive, Share
+from copem_replay.components import Count, Flag, Frozen, NotNegative, Number, Positive, Share
 from copem_replay.pem.condition import ClassNames, Pem
 
 
@@ -25,6 +25,12 @@ def _unit_name(value: str) -> str:
     return value
 
 
+def _version(value: object) -> object:
+    if isinstance(value, bool):  # equals 1 to Python
+        raise ValueError(f"expected 1, found {str(value).lower()}")
+    return value
+
+
 def _configuration_name(value: str) -> str:
     # The name is part of topics and of entity paths.
     if not value or "/" in value or not value.isprintable():
@@ -32,10 +38,12 @@ def _configuration_name(value: str) -> str:
     return value
 
 
-Id = Annotated[str, BeforeValidator(_identifier)]
+Id = Annotated[str, BeforeValidator(_identifier), WithJsonSchema({"type": ["string", "integer"]})]
 UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 Point = tuple[Number, Number]
+Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
+"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 
 
 class Unit(Frozen):
@@ -48,7 +56,7 @@ class Unit(Frozen):
     height_m: NotNegative
     ground_z_m: Number | None = None
     pem: Id
-    rate_hz: Positive | None = None
+    rate_hz: Annotated[float, Field(strict=True, ge=0.001, le=1000)] | None = None
     phase_s: NotNegative = 0.0
 
     @model_validator(mode="after")
@@ -95,7 +103,7 @@ class Configuration(Frozen):
 
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
     fusion: Ideal = Ideal()
-    latency_s: NotNegative | dict[Id, NotNegative] = 0.0
+    latency_s: Latency | dict[Id, Latency] = 0.0
     max_age_s: Positive = 1.0
 
     def latency_of(self, unit: str) -> float:
@@ -175,7 +183,7 @@ class Measure(Frozen):
 
     objects: Objects = Objects()
     onset: Onset = InRange()
-    count_earlier: bool = False
+    count_earlier: Flag = False
     confirm: Confirm = Confirm()
     distance_to: Id = "ego"
     horizon_s: Positive | None = None
@@ -190,14 +198,14 @@ class Read(Frozen):
 class Show(Frozen):
     """Which logs and which run are written to MCAP and .rrd; `run: null` writes none."""
 
-    logs: tuple[str, ...] = ("first",)
+    logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst"] | None = 0
 
 
 class Experiment(Frozen):
     """An experiment file."""
 
-    version: Literal[1]
+    version: Annotated[Literal[1], BeforeValidator(_version)]
     logs: Annotated[tuple[str, ...], Field(min_length=1)]
     read: Read = Read()
     ego: Id | None = None

@@ -1,24 +1,19 @@
-"""Experiment files: YAML 1.2 in and out, every problem with file, line and key."""
+"""Experiment files: every problem with file, line and key."""
 
 from __future__ import annotations
 
 import difflib
 import glob
-from collections.abc import Iterator
-from dataclasses import dataclass
-from io import StringIO
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 
 from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
-
-Key = tuple[str | int, ...]
+from copem_replay.plain_yaml import Key, NotYamlError, read
 
 
 @dataclass(frozen=True)
@@ -28,20 +23,23 @@ class Source:
     path: Path
     data: dict[str, Any]
     lines: dict[Key, int]
-    problems: tuple[str, ...]  # duplicate keys: the file is refused, but the rest is checked all the same
+    problems: tuple[str, ...]  # of its YAML: the file is refused, but the rest is checked all the same
+    logs: tuple[str, ...] = ()  # to replay instead of those it names, relative to where we are
 
-    def at(self, key: Key, message: str) -> str:
-        """`file:line: key: message`."""
-        known = next(key[:n] for n in range(len(key), -1, -1) if key[:n] in self.lines)
+    def at(self, key: Key, message: str, line: int | None = None) -> str:
+        """`file:line: key: message`; by default the line of the key, or of what it should be in."""
+        if line is None:
+            line = next(self.lines[key[:n]] for n in range(len(key), -1, -1) if key[:n] in self.lines)
         name = dotted(key)
-        return f"{self.path}:{self.lines[known]}: {name + ': ' if name else ''}{message}"
+        return f"{self.path}:{line}: {name + ': ' if name else ''}{message}"
 
 
 def dotted(key: Key) -> str:
     """`units.ego.height_m`, `logs[0]`."""
     text = ""
     for part in key:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+        name = part or "''"
+        text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else str(name)
     return text
 
 
@@ -54,52 +52,19 @@ def load(path: Path) -> Source:
     except IsADirectoryError:
         raise ExperimentError(f"{path}: is a folder; expected an experiment file (YAML)") from None
     except UnicodeDecodeError as error:
-        raise ExperimentError(
-            f"{path}: expected YAML text in UTF-8, found byte {error.object[error.start]:#x}"
-        ) from None
+        line, byte = error.object.count(b"\n", 0, error.start) + 1, error.object[error.start]
+        raise ExperimentError(f"{path}:{line}: expected YAML text in UTF-8, found byte {byte:#x}") from None
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
-    reader = YAML(typ="safe", pure=True)
     try:
-        root = reader.compose(StringIO(text))
-    except MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = mark.line + 1 if mark else 1
-        raise ExperimentError(f"{path}:{line}: not YAML: {error.problem or error.context}") from None
-    except YAMLError as error:
-        raise ExperimentError(f"{path}:1: not YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(root, MappingNode):
-        found = "an empty file" if root is None else f"a {root.id}"
+        data, lines, problems = read(text)
+    except NotYamlError as error:
+        raise ExperimentError(f"{path}:{error.line}: not YAML: {error.why}") from None
+    if not isinstance(data, dict):
+        found = "an empty file" if data is None else "a list" if isinstance(data, list) else "text"
         raise ExperimentError(f"{path}:1: expected keys and values such as `version: 1`, found {found}")
-    lines: dict[Key, int] = {(): 1}
-    duplicates: list[tuple[Key, int]] = []
-    data = _plain(root, (), lines, duplicates, reader)
-    problems = tuple(f"{path}:{line}: {dotted(key)}: key given twice" for key, line in duplicates)
-    return Source(path, data, lines, problems)
-
-
-def _plain(node: Node, key: Key, lines: dict[Key, int], duplicates: list[tuple[Key, int]], reader: YAML) -> Any:
-    if isinstance(node, MappingNode):
-        mapping: dict[Any, Any] = {}
-        for name_node, value_node in node.value:
-            name = reader.constructor.construct_object(name_node, deep=True)
-            # Ids may be numbers or text; any other key is text anyway.
-            name = str(name) if isinstance(name, int) and not isinstance(name, bool) else name_node.value
-            inner = (*key, name)
-            line = name_node.start_mark.line + 1
-            if name in mapping:
-                duplicates.append((inner, line))
-                continue
-            lines[inner] = line
-            mapping[name] = _plain(value_node, inner, lines, duplicates, reader)
-        return mapping
-    if isinstance(node, SequenceNode):
-        items = []
-        for k, item in enumerate(node.value):
-            lines[(*key, k)] = item.start_mark.line + 1
-            items.append(_plain(item, (*key, k), lines, duplicates, reader))
-        return items
-    return reader.constructor.construct_object(node, deep=True)
+    source = Source(path, data, lines, ())
+    return replace(source, problems=tuple(source.at(key, message, line) for key, line, message in problems))
 
 
 def parse(source: Source) -> tuple[Experiment | None, list[str]]:
@@ -114,94 +79,133 @@ def parse(source: Source) -> tuple[Experiment | None, list[str]]:
 
 
 def _problems(source: Source, error: ValidationError) -> Iterator[str]:
-    seen = set()
+    """A line per key: the alternatives of one key are said in one, and only what was meant of several is said."""
+    found: dict[Key, list[Any]] = {}
     for item in error.errors(include_url=False):
-        key = _file_key(source.data, item["loc"])
         if item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]:
             continue  # long enough, but what is in it was refused, which has its own line
-        if key not in seen:  # alternatives of one key: the first says enough
-            seen.add(key)
-            yield source.at(key, _message(item, key))
+        found.setdefault(_file_key(source.data, item), []).append(item)
+    for key, items in found.items():
+        if any(other[: len(key)] == key and len(other) > len(key) for other in found):
+            continue  # another alternative fits so far, and says where it does not
+        yield source.at(key, _message(items, key, source.data))
 
 
-def _file_key(data: Any, location: tuple[str | int, ...]) -> Key:
-    """Pydantic's location without what is not in the file (names of alternatives, `[key]`)."""
+def _file_key(data: Any, item: Any) -> Key:
+    """The location pydantic gives, without what is not in the file (names of alternatives, `[key]`)."""
     key: list[str | int] = []
-    here = data
+    here, location = data, item["loc"]
     for k, part in enumerate(location):
-        if isinstance(here, dict) and (part in here or k == len(location) - 1):
+        if isinstance(here, dict) and (part in here or (k == len(location) - 1 and item["type"] == "missing")):
             key.append(part)
             here = here.get(part)
         elif isinstance(here, list) and isinstance(part, int):
             key.append(part)
             here = here[part] if part < len(here) else None
-    while key and key[-1] == "[key]":
-        key.pop()
     return tuple(key)
 
 
-def _message(item: Any, key: Key) -> str:
-    kind, found = item["type"], _short(item["input"])
-    if kind == "extra_forbidden":
-        near = difflib.get_close_matches(str(key[-1]), _known_names(), n=1)
-        return "unknown key" + (f"; did you mean {near[0]}?" if near else "")
-    if kind == "missing":
+_EXPECTED = {
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "keys and values",
+    "model_type": "keys and values",
+    "model_attributes_type": "keys and values",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "finite_number": "a finite number",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "at most {le:g}",
+    "too_short": "at least {min_length} in the list",
+    "too_long": "at most {max_length} in the list",
+    "literal_error": "{expected}",
+    "union_tag_invalid": "kind: one of {expected_tags}",
+    "union_tag_not_found": "{{kind: …}}",
+}
+
+
+def _message(items: Sequence[Any], key: Key, data: Any) -> str:
+    first = items[0]
+    if first["type"] == "extra_forbidden":
+        known = _names_at(key[:-1], data)
+        near = difflib.get_close_matches(str(key[-1]), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+        return "unknown key" + (f"; {hint}" if known else "")
+    if first["type"] == "missing":
         return "missing"
-    if kind == "union_tag_invalid":
-        return f"expected kind: one of {item['ctx']['expected_tags']}; found {item['ctx']['tag']!r}"
-    message: str = item["msg"].removeprefix("Value error, ")
-    if kind in ("value_error", "component"):
-        return message
-    message = message[0].lower() + message[1:].removesuffix(".")
-    message = message.replace("input should be", "expected").replace("expected expected", "expected")
-    return f"{message}, found {found}"
+    if own := [item for item in items if item["type"] not in _EXPECTED]:
+        return str(own[0]["msg"]).removeprefix("Value error, ")
+    if first["type"] == "too_short" and isinstance(first["input"], Mapping):
+        return "expected at least one, found none"
+    words = dict.fromkeys(_EXPECTED[item["type"]].format(**item.get("ctx", {})) for item in items)
+    found = first["ctx"]["tag"] if first["type"] == "union_tag_invalid" else first["input"]
+    return f"expected {', or '.join(words)}, found {_short(found)}"
 
 
-def _known_names() -> list[str]:
-    names: set[str] = set()
+def _names_at(key: Key, data: Any) -> list[str]:
+    """The keys that are known at a place of the file."""
+    schema = Experiment.model_json_schema()
 
-    def walk(schema: Any) -> None:
-        if isinstance(schema, dict):
-            names.update(schema.get("properties", {}))
-            for value in schema.values():
-                walk(value)
-        elif isinstance(schema, list):
-            for value in schema:
-                walk(value)
+    def alternatives(part: Any) -> Iterator[dict[str, Any]]:
+        if isinstance(part, dict):
+            if "$ref" in part:
+                part = schema["$defs"][part["$ref"].rpartition("/")[2]]
+            yield part
+            for inner in (*part.get("anyOf", ()), *part.get("oneOf", ())):
+                yield from alternatives(inner)
 
-    walk(Experiment.model_json_schema())
-    return sorted(names)
+    places = [*alternatives(schema)]
+    for step in key:
+        data = data[step]
+        if isinstance(step, int):
+            inner = [p.get("items") or (p.get("prefixItems") or [{}])[0] for p in places]
+        else:
+            inner = [p.get("properties", {}).get(step) or p.get("additionalProperties") for p in places]
+        places = [found for part in inner for found in alternatives(part)]
+    names = [place["properties"] for place in places if "properties" in place]
+    kinds = [(p.get("kind", {}).get("const"), *p.get("kind", {}).get("enum", ())) for p in names]
+    meant = [place for place, known in zip(names, kinds, strict=True) if data.get("kind") in known]
+    return sorted({name for place in meant or names for name in place})
 
 
 def _short(value: object) -> str:
-    text = repr(value)
+    words = {None: "nothing", True: "true", False: "false"}
+    text = words[value] if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else text[:57] + "…"
 
 
-def log_paths(source: Source) -> tuple[list[Path], list[str]]:
-    """The recordings of `logs:`, globs resolved (sorted), and what is wrong with them."""
-    paths: list[Path] = []
+def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
+    """The recordings to replay and where the file names each, globs resolved (sorted); which patterns match none."""
+    paths: dict[Path, Key | None] = {}
     problems: list[str] = []
-    logs = source.data.get("logs")
-    for k, pattern in enumerate(logs if isinstance(logs, list) else []):
-        if not isinstance(pattern, str):
-            continue
-        full = source.path.parent / pattern
-        if full.exists() or not glob.has_magic(pattern):
-            paths.append(full)
-            continue
-        found = sorted(glob.glob(str(full), recursive=True))
-        if not found:
-            problems.append(source.at(("logs", k), f"no file matches {pattern!r}"))
-        paths += [Path(name) for name in found]
+    for pattern in source.logs:
+        found = matching(pattern, Path())
+        paths |= dict.fromkeys(found)
+        problems += [] if found else [f"--log: no file matches {pattern!r}"]
+    named = source.data.get("logs")
+    for k, pattern in enumerate(named if isinstance(named, list) and not source.logs else []):
+        if isinstance(pattern, str):
+            found = matching(pattern, source.path.parent)
+            paths |= dict.fromkeys(found, ("logs", k))
+            problems += [] if found else [source.at(("logs", k), f"no file matches {pattern!r}")]
     return paths, problems
 
 
-def dump(data: dict[str, Any]) -> str:
-    """Plain data as YAML 1.2 text, keys in order; short lists on one line."""
-    writer = YAML(typ="rt", pure=True)
-    writer.default_flow_style = None
-    writer.width = 110
-    text = StringIO()
-    writer.dump(data, text)
-    return text.getvalue()
+def matching(pattern: str, folder: Path) -> list[Path]:
+    """The files a path relative to `folder` names, sorted; a path without wildcards names itself, there or not."""
+    if is_there(folder / pattern) or not glob.has_magic(pattern):
+        return [folder / pattern]
+    return [folder / name for name in sorted(glob.glob(pattern, root_dir=folder, recursive=True))]
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is something of this name; a name no file can have is none."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False

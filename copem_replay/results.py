@@ -19,9 +19,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from copem_replay.check import place_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import dump
+from copem_replay.plain_yaml import dump
 from copem_replay.read import Recording
 from copem_replay.replay import believed
 from copem_replay.run import Result, log_path_of, shown_logs, shown_run
@@ -31,22 +32,39 @@ _LIBRARIES = (
     "shapely",
 )  # fmt: skip
 _MARK = "provenance.json"
+_EXPERIMENT = "experiment.yaml"
 
 
-def check_target(folder: Path, *, overwrite: bool) -> None:
-    """Whether a results folder may be written here. Raises OutputError."""
-    if not folder.exists():
+def check_target(folder: Path, *, overwrite: bool, inputs: Sequence[Path] = ()) -> None:
+    """Whether a results folder may be written here, and `inputs` stay where they are. Raises OutputError."""
+    try:
+        parent = next((place for place in Path(os.path.abspath(folder)).parents if place.exists()), Path("/"))
+        exists = folder.exists()
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
+    if not parent.is_dir():
+        raise OutputError(f"{folder}: cannot be written: {parent} is a file")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder}: cannot be written: no permission to write in {parent}")
+    if not exists:
         return
     if not folder.is_dir():
         raise OutputError(f"{folder}: expected a folder for the results, found a file")
-    if not any(folder.iterdir()):
-        return
-    if not (folder / _MARK).exists():
+    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+        raise OutputError(f"{folder}: cannot be written: no permission to replace what is in it")
+    empty = not any(folder.iterdir())
+    if not empty and not (folder / _MARK).exists():
         raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
-    if not overwrite:
+    if not empty and not overwrite:
         raise OutputError(
             f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder"
         )
+    place = folder.resolve()
+    if place.is_mount() or place in (Path.cwd(), *Path.cwd().parents):
+        raise OutputError(f"{folder}: cannot be replaced, being in use or a mount point; choose a folder in it")
+    for path in inputs:
+        if path.resolve().is_relative_to(place) and path.resolve() != place / _EXPERIMENT:
+            raise OutputError(f"{folder}: {path} is in it and would go with it; choose another folder with --out")
 
 
 def write_results(
@@ -59,8 +77,8 @@ def write_results(
     overwrite: bool = False,
 ) -> list[str]:
     """Write the folder of the contract. Returns what has to be said of it. Raises OutputError."""
-    check_target(folder, overwrite=overwrite)
-    folder = Path(os.path.abspath(folder))
+    check_target(folder, overwrite=overwrite, inputs=[recording.path for recording in recordings])
+    folder = folder.resolve()
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".tmp"))
@@ -82,15 +100,15 @@ def _fill(
     skipped: Sequence[tuple[Path, str]],
 ) -> list[str]:  # fmt: skip
     data = experiment.as_written()
-    data["logs"] = [os.path.relpath(recording.path.resolve(), folder.resolve()) for recording in recordings]
-    (scratch / "experiment.yaml").write_text(dump(data), encoding="utf-8")
+    data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
+    (scratch / _EXPERIMENT).write_text(dump(data), encoding="utf-8")
     result.table.to_parquet(scratch / "detections.parquet", engine="pyarrow", index=False)
     write_csv(result.summary, scratch / "summary.csv")
     notes = list(result.notes)
     for log in shown_logs(experiment, result):
         target = scratch / "replay" if len(recordings) == 1 else scratch / "replay" / log
         said = _show(target, log, experiment, recordings, result)
-        notes += [said] if said else []
+        notes += [f"{log}: {line}" for line in said]
     provenance = provenance_of(experiment, recordings, result, skipped, notes)
     (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return notes
@@ -98,7 +116,7 @@ def _fill(
 
 def _show(
     target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result
-) -> str | None:
+) -> list[str]:
     from copem_replay.show import write_rrd
     from copem_replay.write import write_mcap
 
@@ -107,8 +125,22 @@ def _show(
     replay = next(r for r in result.replays if r.scene.log == log)
     beliefs = believed(replay, experiment, number)
     rows = result.table[(result.table["log"] == log) & (result.table["run"] == number)]
-    said = write_mcap(Path(f"{target}.mcap"), log_path_of(recordings, log), replay.scene, beliefs)
-    write_rrd(Path(f"{target}.rrd"), replay, experiment, beliefs, rows, result.summary, number)
+    manifest = {
+        "copem_replay": version("copem-replay"),
+        "experiment": dump(experiment.as_written() | {"logs": [log_path_of(recordings, log).name]}),
+        "log": log,
+        "run": str(number),
+    }
+    said = write_mcap(Path(f"{target}.mcap"), log_path_of(recordings, log), replay.scene, beliefs, rows, manifest)
+    write_rrd(
+        Path(f"{target}.rrd"),
+        replay,
+        experiment,
+        {n: b.fused for n, b in beliefs.items()},
+        rows,
+        result.summary,
+        number,
+    )
     return said
 
 

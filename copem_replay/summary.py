@@ -100,8 +100,8 @@ def _of_one(
         "ttd_p95_s": quantile_time(times, incidence, 0.95),
         "ttd_rmst_s": restricted_mean(times, incidence, horizon_s) if horizon_s is not None else None,
         "ttd_rmst_horizon_s": horizon_s,
-        "dad_median_m": quantile_with_never(distance_m[placed], detected[placed], 0.5),
-        "dad_p5_m": quantile_with_never(distance_m[placed], detected[placed], 0.05),
+        "dad_median_m": quantile_with_never(distance_m[placed], detected[placed], 0.5) if placed.any() else None,
+        "dad_p5_m": quantile_with_never(distance_m[placed], detected[placed], 0.05) if placed.any() else None,
     }
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from copem_replay.resample import at_instants, states_at, wrap
-from copem_replay.tracks import TRUTH, VALUES, Tracks
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from copem_replay.resample import at_instants, states_at, wrap
+from copem_replay.tracks import TRUTH, VALUES, Tracks
 from scenes import T0_NS
 
 MS = 1_000_000
@@ -252,6 +252,7 @@ def objects(draw: st.DrawFn) -> dict[int, list[Sighting]]:
     return result
 
 
+@settings(deadline=None)
 @given(objects(), st.data())
 def test_against_the_oracle(seen: dict[int, list[Sighting]], data: st.DataObject) -> None:
     frames = sorted({s.at_ns for each in seen.values() for s in each} | {0})

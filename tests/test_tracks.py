@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from copem_replay.tracks import CLASS_GROUPS, CLASSES, UNCERTAINTIES, VALUES, Scene, Tracks, class_indices
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from copem_replay.tracks import CLASS_GROUPS, CLASSES, UNCERTAINTIES, VALUES, Scene, Tracks, class_indices
 
 Seen = dict[str, list[list[str]]]
 """What each unit lists: its lists in order of capture, each the objects it holds."""
@@ -148,6 +149,7 @@ class TestShapes:
             tracks(SEEN).x_m = np.zeros((1, 11))  # type: ignore[misc]
 
 
+@settings(deadline=None)
 @given(seen_by_units)
 def test_what_each_row_belongs_to(seen: Seen) -> None:
     of = tracks(seen)
@@ -160,6 +162,7 @@ def test_what_each_row_belongs_to(seen: Seen) -> None:
     assert len(of.track_ix) == len(of.row_object_ix) == len(of.row_unit_ix) == len(of.row_captured_s)
 
 
+@settings(deadline=None)
 @given(seen_by_units)
 def test_by_frame(seen: Seen) -> None:
     of = tracks(seen)
@@ -171,6 +174,7 @@ def test_by_frame(seen: Seen) -> None:
         assert order[bounds[f] : bounds[f + 1]].tolist() == [p for p, g in enumerate(of.frame_ix) if g == f]
 
 
+@settings(deadline=None)
 @given(seen_by_units, st.data())
 def test_take_tracks(seen: Seen, data: st.DataObject) -> None:
     of = tracks(seen, exact=("yaw_var_rad2",))
@@ -184,6 +188,7 @@ def test_take_tracks(seen: Seen, data: st.DataObject) -> None:
     assert len(taken.unit_ix) == len(kept)
 
 
+@settings(deadline=None)
 @given(seen_by_units, st.lists(st.sampled_from(["mast", "van", "ego", "bike", "nobody"]), unique=True))
 def test_take_units(seen: Seen, names: list[str]) -> None:
     of = tracks(seen, exact=("size_var_m2", "speed_var_m2ps2"))

@@ -77,7 +77,9 @@ class TestOncomingCar:
         onset = {"kind": "in_range", "range_m": 80}
         later = row(replayed(scenes.oncoming_car(), **sees_all), "PEM")
         assert later["time_to_detection_s"] == 0
-        earlier = row(replayed(scenes.oncoming_car(), **sees_all, measure={"onset": onset, "count_earlier": True}), "PEM")
+        earlier = row(
+            replayed(scenes.oncoming_car(), **sees_all, measure={"onset": onset, "count_earlier": True}), "PEM"
+        )
         assert earlier["time_to_detection_s"] == pytest.approx(-2.0)
         assert earlier["distance_at_detection_m"] == pytest.approx(100.0)
 

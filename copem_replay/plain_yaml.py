@@ -1,0 +1,163 @@
+"""YAML 1.2 as plain data and back: `on`, `off`, `yes`, `no`, dates and 1_000 are text, and each key has its line."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from io import StringIO
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
+from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+
+Key = tuple[str | int, ...]
+"""The way to a value: keys and places in lists."""
+
+
+class NotYamlError(Exception):
+    """A text is not YAML: at which line, and why."""
+
+    def __init__(self, line: int, why: str) -> None:
+        super().__init__(f"line {line}: {why}")
+        self.line, self.why = line, why
+
+
+def read(text: str) -> tuple[Any, dict[Key, int], list[tuple[Key, int, str]]]:
+    """Plain data, the line of each key, and problems that leave the rest readable (key, line, message).
+
+    Raises NotYamlError.
+    """
+    root = _composed(text)
+    if root is None:
+        return None, {(): 1}, []
+    reading = _Reading()
+    return reading.plain(root, ()), reading.lines, reading.problems
+
+
+def _composed(text: str) -> Node | None:
+    """The nodes of a text, None where it is empty. Raises NotYamlError."""
+    line, why = 1, ""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an anchor's name may be used again
+            root: Node | None = YAML(typ="safe", pure=True).compose(StringIO(text))
+            return root
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else 1
+        why = error.problem or error.context
+        if why.startswith("but ") and error.context:
+            why = f"{error.context} {why}"
+    except YAMLError as error:
+        position = getattr(error, "position", 0)
+        line = text.count("\n", 0, position) + 1
+        why = f"character {text[position]!r} is not allowed" if position else str(error)
+    except RecursionError:
+        why = "nested too deeply"
+    raise NotYamlError(line, " ".join(why.split()))
+
+
+_CORE: tuple[tuple[re.Pattern[str], Any], ...] = (
+    (re.compile(r"~|null|Null|NULL|"), lambda text: None),
+    (re.compile(r"true|True|TRUE"), lambda text: True),
+    (re.compile(r"false|False|FALSE"), lambda text: False),
+    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"0o[0-7]+"), lambda text: int(text, 0)),
+    (re.compile(r"0x[0-9a-fA-F]+"), lambda text: int(text, 0)),
+    (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
+    (re.compile(r"[-+]?\.(inf|Inf|INF)"), lambda text: float(text.replace(".", ""))),
+    (re.compile(r"\.nan|\.NaN|\.NAN"), lambda text: math.nan),
+)
+"""What a plain scalar stands for: the core schema of YAML 1.2.2 (10.3.2). Everything else is text."""
+
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./:+-]*[A-Za-z0-9_./]|[A-Za-z]")
+"""Text that nobody takes for anything else, in a list or out of it: written without quotes if it is no number."""
+
+
+def _core(text: str) -> Any:
+    for pattern, value_of in _CORE:
+        if pattern.fullmatch(text):
+            return value_of(text) if len(text) < 1000 else text  # Python's own limit on digits is a few thousand
+    return text
+
+
+@dataclass
+class _Reading:
+    """Nodes into plain data: where each key stands, and what is wrong on the way."""
+
+    lines: dict[Key, int] = field(default_factory=lambda: {(): 1})
+    problems: list[tuple[Key, int, str]] = field(default_factory=list)
+    within: list[Node] = field(default_factory=list)
+
+    def plain(self, node: Node, key: Key) -> Any:
+        """A node as plain data."""
+        if isinstance(node, ScalarNode):
+            return self._scalar(node, key)
+        if any(node is outer for outer in self.within):
+            self._problem(node, key, "an alias of something that holds it")
+            return None
+        self.within.append(node)
+        value = self._mapping(node, key) if isinstance(node, MappingNode) else self._sequence(node, key)
+        self.within.pop()
+        return value
+
+    def _mapping(self, node: Node, key: Key) -> dict[str, Any]:
+        mapping: dict[str, Any] = {}
+        for name_node, value_node in node.value:
+            if not isinstance(name_node, ScalarNode):
+                self._problem(name_node, key, "expected text or a number as a key, found a list or keys and values")
+                continue
+            plain = self._scalar(name_node, key)
+            # Ids may be numbers or text; any other key is text anyway.
+            name = str(plain) if isinstance(plain, int) and not isinstance(plain, bool) else name_node.value
+            inner = (*key, name)
+            if name == "<<" and name_node.style is None:
+                self._problem(name_node, inner, "not in YAML 1.2: write out the keys, or use an alias for all of them")
+            elif name in mapping:
+                self._problem(name_node, inner, "key given twice")
+            else:
+                self.lines[inner] = name_node.start_mark.line + 1
+                mapping[name] = self.plain(value_node, inner)
+        return mapping
+
+    def _sequence(self, node: Node, key: Key) -> list[Any]:
+        for k, item in enumerate(node.value):
+            self.lines[(*key, k)] = item.start_mark.line + 1
+        return [self.plain(item, (*key, k)) for k, item in enumerate(node.value)]
+
+    def _scalar(self, node: ScalarNode, key: Key) -> Any:
+        if node.tag == "tag:yaml.org,2002:str":
+            return node.value
+        if str(node.tag).rpartition(":")[2] in ("null", "bool", "int", "float", "timestamp", "value", "merge"):
+            return _core(node.value)
+        self._problem(node, key, f"tag {node.tag} is not known here")
+        return node.value
+
+    def _problem(self, node: Node, key: Key, message: str) -> None:
+        self.problems.append((key, node.start_mark.line + 1, message))
+
+
+def dump(data: dict[str, Any]) -> str:
+    """Plain data as YAML 1.2 text, keys in order; short lists on one line."""
+    writer = YAML(typ="rt", pure=True)
+    writer.default_flow_style = None
+    writer.width = 110
+    text = StringIO()
+    writer.dump(_quoted(data), text)
+    return text.getvalue()
+
+
+def _quoted(value: Any) -> Any:
+    """Text that would not be read as the same text is put in quotes."""
+    if isinstance(value, str):
+        plain = _PLAIN.fullmatch(value) and isinstance(_core(value), str)
+        return value if plain else DoubleQuotedScalarString(value)
+    if isinstance(value, Mapping):
+        return {_quoted(name): _quoted(inner) for name, inner in value.items()}
+    return [_quoted(inner) for inner in value] if isinstance(value, list) else value
