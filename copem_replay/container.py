@@ -11,37 +11,22 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile
 from mcap.reader import SeekingReader
-from mcap.records import Channel as ChannelRecord
-from mcap.records import DataEnd, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.records import Message
+from mcap.stream_reader import CRCValidationError
 from mcap.summary import Summary
 
 from copem_replay.errors import RecordingError
+from copem_replay.salvage import DAMAGE, MAGIC, RECORD_LIMIT_BYTES, FromStart
 
-MAGIC = b"\x89MCAP0\r\n"
 _LFS_POINTER = b"version https://git-lfs"
-RECORD_LIMIT_BYTES = 1 << 30  # a longer record is taken for damage (chosen)
 _FOOTER_BYTES = 20  # summary_start, summary_offset_start, summary_crc
-DAMAGE = (
-    McapError,
-    struct.error,
-    EOFError,
-    ValueError,  # includes checksums that fail and texts that are not UTF-8
-    KeyError,
-    RuntimeError,  # lz4
-    OSError,  # an index that points outside of the file
-    OverflowError,  # … far outside
-    zstandard.ZstdError,
-    MemoryError,  # a length that was hit
-)
-"""What reading a damaged file raises."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +58,7 @@ class Log:
     indexed: bool
     damage: str | None = None
     complete: bool = True
+    went_on: bool = False  # whether messages after the damage were read
 
     def payloads(self, numbers: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
         """Messages of some channels: channel number, log time in ns, payload.
@@ -81,7 +67,7 @@ class Log:
         """
         topics = {c.topic for c in self.channels if c.number in numbers}
         with open_file(self.path) as file:
-            for message in _by_index(file, topics) if self.indexed else _Stream(file):
+            for message in _by_index(file, topics) if self.indexed else FromStart(file):
                 if isinstance(message, Message) and message.channel_id in numbers:
                     yield message.channel_id, message.log_time, message.data
 
@@ -121,7 +107,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
     """
     counts: Counter[int] = Counter()
     with open_file(path) as file:
-        stream = _Stream(file)
+        stream = FromStart(file)
         for record in stream:
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
@@ -130,7 +116,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
         Channel(
             number=number,
             topic=channel.topic,
-            schema=stream.schemas.get(channel.schema_id, ""),
+            schema=stream.schemas[channel.schema_id].name if channel.schema_id in stream.schemas else "",
             encoding=channel.message_encoding,
             messages=counts[number],
             expected=expected.get(number),
@@ -141,10 +127,9 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
     damage = _reason(error) if error else None
     if damage and not sum(counts.values()):
         raise RecordingError(f"{path}: damaged, and no message can be read ({damage})")
-    complete = error is None or stream.data_ended
-    if damage and complete:
+    if damage and stream.complete:
         damage = f"its index cannot be used ({damage}): read from start to end, no message is lost"
-    return Log(path, channels, indexed=False, damage=damage, complete=complete)
+    return Log(path, channels, indexed=False, damage=damage, complete=stream.complete, went_on=stream.went_on)
 
 
 def _reason(error: BaseException) -> str:
@@ -166,32 +151,6 @@ def _by_index(file: IO[bytes], topics: set[str]) -> Iterator[Message]:
             yield message
     except DAMAGE as error:
         raise BrokenIndexError from error
-
-
-@dataclass
-class _Stream:
-    """The records of a file from its start. Damage ends it, silently: look at `error` afterwards."""
-
-    file: IO[bytes]
-    schemas: dict[int, str] = field(default_factory=dict)  # id → name
-    channels: dict[int, ChannelRecord] = field(default_factory=dict)
-    data_ended: bool = False
-    error: Exception | None = None
-
-    def __iter__(self) -> Iterator[McapRecord]:
-        self.file.seek(0)
-        try:
-            reader = StreamReader(self.file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
-            for record in reader.records:
-                if isinstance(record, Schema):
-                    self.schemas.setdefault(record.id, record.name)
-                elif isinstance(record, ChannelRecord):
-                    self.channels.setdefault(record.id, record)
-                elif isinstance(record, DataEnd):
-                    self.data_ended = True
-                yield record
-        except DAMAGE as error:
-            self.error = error
 
 
 def _check_magic(path: Path, file: IO[bytes]) -> None:

@@ -165,11 +165,14 @@ class At(Frozen):
 Onset = Annotated[StartsMoving | Appears | InRange | LineOfSight | At, Field(discriminator="kind")]
 
 
+Captures = Annotated[int, Field(strict=True, ge=1, le=1000)]
+
+
 class Confirm(Frozen):
     """Detected when `hits` of the last `of` capture instants hold the object."""
 
-    hits: Count = 1
-    of: Count = 1
+    hits: Captures = 1
+    of: Captures = 1
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

@@ -7,16 +7,15 @@ sorted.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from copem_replay.container import DAMAGE, RECORD_LIMIT_BYTES, open_file, open_log
+from copem_replay.container import open_file, open_log
+from copem_replay.salvage import DAMAGE, RECORD_LIMIT_BYTES, FromStart
 
 
 class Catalogue:
@@ -83,20 +82,18 @@ class Original:
 
     def _salvage(self) -> None:
         self._salvaged, self._attachments = [], []
-        with open_file(self._path) as file, suppress(*DAMAGE):
-            for record in StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES).records:
+        with open_file(self._path) as file:
+            stream = FromStart(file)
+            for record in stream:
                 if isinstance(record, Header):
                     self.profile = record.profile
-                elif isinstance(record, Schema):
-                    self._schemas.setdefault(record.id, record)
-                elif isinstance(record, Channel):
-                    self.channels.setdefault(record.id, record)
                 elif isinstance(record, Metadata):
                     self.metadata.setdefault(record.name, dict(record.metadata))
                 elif isinstance(record, Attachment):
                     self._attachments.append(record)
                 elif isinstance(record, Message):
                     self._salvaged.append(record)
+        self._schemas, self.channels = stream.schemas, stream.channels
         self._salvaged.sort(key=lambda m: m.log_time)
 
     def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:

@@ -140,7 +140,7 @@ def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
     number = sum(c.messages for c in channels)
     expected = sum(c.expected for c in channels if c.expected is not None)
     of = f" of {expected}" if expected else ""
-    after = "damaged" if end_s is None else f"damaged after {end_s:.3f} s"
+    after = "damaged" if end_s is None or log.went_on else f"damaged after {end_s:.3f} s"
     return f"{after}: {number}{of} messages read ({log.damage})"
 
 

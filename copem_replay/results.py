@@ -161,13 +161,18 @@ def provenance_of(
         "logs": [
             {"log": r.scene.log, "topic": r.topic, "sha256": _sha256(r.path)} for r in recordings
         ],
-        "logs_skipped": [{"log": path.name, "reason": reason} for path, reason in skipped],
+        "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility,
         "max_gap_s": experiment.max_gap_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
         "run_shown": {log: shown_run(experiment, result, log) for log in shown_logs(experiment, result)},
         "notes": list(notes),
     }  # fmt: skip
+
+
+def _utf8(name: str) -> str:
+    """A file's name as text: bytes that are not UTF-8 as `\\udc…`."""
+    return name.encode(errors="backslashreplace").decode()
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:

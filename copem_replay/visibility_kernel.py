@@ -4,6 +4,8 @@ How: between the azimuths of two neighbouring corners, the inverse distance to t
 by) is linear in the ray's direction u, so the slope at which each body begins and ends to cover is linear in u too.
 Slopes are equal where a linear function of u vanishes: these azimuths are found in closed form and split the interval.
 What is left is a smooth ratio of two linear functions, integrated with three Gauss points.
+
+All in one file, because Numba's cache on disk only notices changes in the file of the function it compiled.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ class TestInstalled:
         assert done.returncode == 0
         assert done.stderr == ""
         assert done.stdout.splitlines()[0].startswith("configuration  n  list_rate_hz  detected_share")
-        assert {len(line.split()) for line in done.stdout.splitlines()[1:4]} == {10, 11}
+        assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["GT", "PEM", "coPEM"]
         assert done.stdout.endswith("results in out/e\n")
         assert table(here / "out" / "e").shape[0] == 12
 
@@ -267,13 +267,13 @@ class TestCheck:
         ended = call("check", "e.yaml")
         assert ended.code == 2
         assert ended.out == ""
-        assert [line.partition(" ")[0] + line.partition(" ")[2][:30] for line in ended.lines] == [
-            "e.yaml:2:logs[2]: no file matches 'x*'",
-            "e.yaml:12:units.mast.pem: no PEM is named",
-            "e.yaml:18:show.run: expected a run below",
-            "e.yaml:1:ego: drive.mcap: no ego vehicl",
-            "e.yaml:12:units.mast.on: drive.mcap: no ",
-            "e.yaml:2:logs[1]: none.mcap: no such fi",
+        assert [line[:40] for line in ended.lines] == [
+            "e.yaml:2: logs[2]: no file matches 'x*'",
+            "e.yaml:12: units.mast.pem: no PEM is nam",
+            "e.yaml:18: show.run: expected a run belo",
+            "e.yaml:1: ego: drive.mcap: no ego vehicl",
+            "e.yaml:12: units.mast.on: drive.mcap: no",
+            "e.yaml:2: logs[1]: none.mcap: no such fi",
         ]
 
     def test_a_key_cannot_break_the_line(self, here: Path, call: Call) -> None:
@@ -342,7 +342,7 @@ class TestRun:
         assert ended.lines == ["note: drive: no measured object has an onset: no rows"]
         found = table(here / "out/e")
         assert len(found) == 0
-        assert found.dtypes["onset_s"] == float
+        assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
         assert ended.out.splitlines()[1].split() == ["GT", "0", "10", "–", "–", "–", "–", "–", "–", "–"]
 
@@ -382,6 +382,8 @@ class TestRun:
             assert r"caf\udce9.mcap: " in ended.lines[0]
             assert len(ended.lines) == 1
         assert ended.code == 1
+        skipped = json.loads((here / "out/e/provenance.json").read_text())["logs_skipped"]
+        assert [one["log"] for one in skipped] == [r"caf\udce9.mcap"]
 
 
 class TestOptions:
@@ -640,7 +642,11 @@ class TestTarget:
     def test_no_permission(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         """Said before anything is replayed."""
         access = os.access
-        monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked" and access(path, mode))
+
+        def locked(path: Any, mode: int) -> bool:
+            return access(path, mode) and not (mode & os.W_OK and Path(path).name == "locked")
+
+        monkeypatch.setattr(os, "access", locked)
         (here / "locked").mkdir()
         ended = call("run", "e.yaml", "--out", "locked")
         assert ended.lines == ["locked: cannot be written: no permission to replace what is in it"]
@@ -693,14 +699,11 @@ class Failure(NamedTuple):
     line: str
 
 
+DEFECT = "copem-replay: this is a defect of copem_replay; please report it with the lines above"
 DISK = OSError(errno.ENOSPC, "No space left on device")
 FAILURES = [
     Failure(DISK, 2, "{here}/out/e: cannot be written: No space left on device"),
-    Failure(
-        RuntimeError("oops"),
-        70,
-        "copem-replay: this is a defect of copem_replay; please report it with the lines above",
-    ),
+    Failure(RuntimeError("oops"), 70, DEFECT),
     Failure(KeyboardInterrupt(), 130, "interrupted"),
     Failure(MemoryError(), 2, "copem-replay: not enough memory; take fewer runs, units or objects at a time"),
 ]
@@ -722,11 +725,8 @@ class TestFailure:
         assert ended.lines[-1] == failure.line.format(here=here)
         assert len(ended.lines) == 1 or ended.code == 70
         assert written(here) == before
-        assert (
-            os.listdir(here / "out") == (["e"] if "--overwrite" in arguments else [])
-            if (here / "out").exists()
-            else True
-        )
+        left = os.listdir(here / "out") if (here / "out").exists() else []
+        assert left == (["e"] if "--overwrite" in arguments else [])
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
     @pytest.mark.parametrize("step", ["write_csv", "provenance_of", "_replace"])
@@ -781,9 +781,7 @@ class TestFailure:
         assert ended.lines[0] == "Traceback (most recent call last):"
         assert "ZeroDivisionError: division by zero" in ended.lines
 
-    def test_a_log_that_vanishes_is_a_defect_no_longer_than_it_is_read(
-        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_log_that_vanishes(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         """A recording that is gone when its checksum is taken: no results, and the reason in a line."""
         monkeypatch.setattr(results, "write_csv", lambda *_: (here / "drive.mcap").unlink())
         ended = call("run", "e.yaml")
@@ -984,9 +982,10 @@ class TestExtremes:
             "  ego: {on: ego, height_m: 1, pem: onboard, offset_m: [1e12, -1e12]}",
             "    - when: {range_m: [0, 1e12], azimuth_deg: [-1e12, 1e12], visible_share: [1, 1]}",
             "      error: {kind: gaussian, covariance_m2: [[1e12, 0], [0, 1e12]], mean_m: [1e12, 1e12]}",
-            "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12, speed_sigma_mps: 1e12}",
+            "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
+            "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]], size_sigma_m: 1e12}",
-            "measure: {onset: {kind: in_range, range_m: 1e12}, horizon_s: 1e12, confirm: {hits: 1000000000, of: 1000000000}}",
+            "measure: {onset: {kind: in_range, range_m: 1e12}, horizon_s: 1e12, confirm: {hits: 1000, of: 1000}}",
             "measure: {onset: {kind: in_range, range_m: 1e12}, horizon_s: 1e-300}",
             "measure: {onset: {kind: at, time_s: 1e12}}",
             "measure: {onset: {kind: starts_moving, speed_mps: 1e-300, within_m: 1e12}}",
