@@ -132,6 +132,8 @@ class _Reading:
         return [self.plain(item, (*key, k)) for k, item in enumerate(node.value)]
 
     def _scalar(self, node: ScalarNode, key: Key) -> Any:
+        if any("\ud800" <= c <= "\udfff" for c in node.value):
+            self._problem(node, key, "half a character (a surrogate)")
         if node.tag == "tag:yaml.org,2002:str":
             return node.value
         if str(node.tag).rpartition(":")[2] in ("null", "bool", "int", "float", "timestamp", "value", "merge"):

@@ -102,7 +102,7 @@ def _fill(
     data = experiment.as_written()
     data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
     (scratch / _EXPERIMENT).write_text(dump(data), encoding="utf-8")
-    result.table.to_parquet(scratch / "detections.parquet", engine="pyarrow", index=False)
+    write_parquet(result.table, scratch / "detections.parquet")
     write_csv(result.summary, scratch / "summary.csv")
     notes = list(result.notes)
     for log in shown_logs(experiment, result):
@@ -171,8 +171,18 @@ def provenance_of(
 
 
 def _utf8(name: str) -> str:
-    """A file's name as text: bytes that are not UTF-8 as `\\udc…`."""
+    """A file's name as text that can be written: bytes that are not UTF-8 escaped."""
     return name.encode(errors="backslashreplace").decode()
+
+
+def write_parquet(table: pd.DataFrame, path: Path) -> None:
+    """A table as Parquet: NaN as null, text as `string` whatever pandas keeps it in."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    arrow = pa.Table.from_pandas(table, preserve_index=False)
+    fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
+    parquet.write_table(arrow.cast(pa.schema(fields, arrow.schema.metadata)), path)
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:

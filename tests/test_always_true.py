@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scenes import Thing, driving, experiment, recording
 
 from copem_replay.read import Recording
 from copem_replay.replay import believed, prepare
 from copem_replay.resample import states_at
 from copem_replay.run import run
+from scenes import Thing, driving, experiment, recording
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from scipy import stats
 from scipy.special import ndtri
 
@@ -16,6 +15,7 @@ from copem_replay.read import Recording
 from copem_replay.replay import believed, blocks, prepare, replay_block
 from copem_replay.run import run
 from copem_replay.tracks import Tracks
+from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 
 def words(*hexadecimal: str) -> tuple[np.uint64, ...]:
@@ -28,7 +28,7 @@ def words(*hexadecimal: str) -> tuple[np.uint64, ...]:
         (["0"] * 6, "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
         (["ffffffff"] * 6, "408f276d 41c83b0e a20bc7c6 6d5451fd"),
         (
-            "243f6a88 85a308d3 13198a2e 03707344 a4093822 299f31d0".split(),
+            ["243f6a88", "85a308d3", "13198a2e", "03707344", "a4093822", "299f31d0"],
             "d16cfe09 94fdcceb 5001e420 24126ea1",
         ),
     ],

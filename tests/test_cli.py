@@ -799,7 +799,7 @@ def raising(error: BaseException) -> Callable[..., None]:
 
 class TestView:
     @pytest.fixture
-    def viewer(self, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    def viewer(self, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
         """A viewer that writes down what it is asked to open, and ends as VIEWER_ENDS says."""
         folder = tmp_path_factory.mktemp("viewer")
         (folder / "rerun.py").write_text(
@@ -808,7 +808,7 @@ class TestView:
             "sys.exit(int(os.environ.get('VIEWER_ENDS', 0)))\n"
         )
         monkeypatch.setenv("PYTHONPATH", str(folder))
-        yield folder / "asked.json"
+        return folder / "asked.json"
 
     def test_opens_the_recording(self, tmp_path: Path, call: Call, viewer: Path) -> None:
         (tmp_path / "-r").mkdir()

@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 import pytest
-from copem_replay.info import describe, survey
 
+from copem_replay.info import describe, survey
 from recordings import SHARED, Obj, Topic, pedestrian, truth_topic, write_mcap, write_recording
 
 # A car at 10 m/s for 1.5 s, a pedestrian who is there at 0, 0.25 and 1.5 s, a cone; no list at 1 s.

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from copem_replay.errors import RecordingError
-from copem_replay.read import Recording, read
-from copem_replay.tracks import CLASSES, TRUTH, VALUES
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_sensorview_pb2 import SensorView
 
+from copem_replay.errors import RecordingError
+from copem_replay.read import Recording, read
+from copem_replay.tracks import CLASSES, TRUTH, VALUES
 from recordings import (
     ANIMAL,
     PEDESTRIAN,

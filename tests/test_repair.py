@@ -4,10 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from copem_replay.repair import HEIGHTS_M, heights, velocities
-from copem_replay.tracks import CLASSES
 from hypothesis import given
 from hypothesis import strategies as st
+
+from copem_replay.repair import HEIGHTS_M, heights, velocities
+from copem_replay.tracks import CLASSES
 
 NAN = float("nan")
 

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from copem_replay.statistics import (
     CENSORED,
     DETECTED,
@@ -20,8 +23,6 @@ from copem_replay.statistics import (
     restricted_mean,
     wilson,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 
 Array = npt.NDArray[np.float64]
 Person = tuple[int, int]

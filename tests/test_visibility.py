@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from visibility_oracle import flat_share, prism, random_observer, random_scene, rectangle, surface_share
 
 from copem_replay.read import read
 from copem_replay.tracks import Tracks
@@ -22,6 +21,7 @@ from copem_replay.visibility import (
     statics,
     visible_shares,
 )
+from visibility_oracle import flat_share, prism, random_observer, random_scene, rectangle, surface_share
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 ERROR = 0.01  # the most that any view may be off

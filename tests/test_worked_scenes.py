@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-import scenes
-from scenes import EGO_UNIT, Thing, experiment, recording, standing
 
+import scenes
 from copem_replay.candidates import candidates
 from copem_replay.read import Recording
 from copem_replay.resample import at_instants
 from copem_replay.run import Result, run
+from scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 
 def replayed(log: Recording, **changes: Any) -> Result:
