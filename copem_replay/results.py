@@ -114,9 +114,7 @@ def _fill(
     return notes
 
 
-def _show(
-    target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result
-) -> list[str]:
+def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> list[str]:
     from copem_replay.show import write_rrd
     from copem_replay.write import write_mcap
 

@@ -199,6 +199,16 @@ class TestInstalled:
         assert (done.returncode, done.stderr) == (0, "")
         assert r"4.00 \xd7 2.00 \xd7 1.50 m" in done.stdout
 
+    def test_progress_on_a_terminal_only(self, here: Path) -> None:
+        reading, writing = os.openpty()
+        done = installed("run", "e.yaml", folder=here, stderr=writing)
+        shown = os.read(reading, 100_000).decode()
+        os.close(reading)
+        os.close(writing)
+        assert done.returncode == 0
+        assert "replaying" in shown
+        assert "\x1b" not in done.stdout
+
     def test_closed_streams(self, here: Path) -> None:
         close = "import os, sys; os.close(int(sys.argv[1])); os.execv(sys.argv[2], sys.argv[2:])"
         for stream in ("1", "2"):
@@ -247,6 +257,13 @@ class TestInfo:
         assert "truth: truth" in ended.out
         ended = call("info", "--json", "none.mcap", "drive.mcap")
         assert [one["readable"] for one in json.loads(ended.out)] == [False, True]
+
+    def test_topic_that_would_colour_the_terminal(self, here: Path, call: Call) -> None:
+        frames = [(0.1 * k, [Obj(id=1)]) for k in range(3)]
+        write_mcap(here / "odd.mcap", [truth_topic(frames, name="a\x1b[31m\nb", host=1)])
+        ended = call("info", "odd.mcap")
+        assert ended.code == 0
+        assert r"truth: a\x1b[31m\nb" in ended.out.splitlines()
 
     def test_name_that_would_break_the_line(self, here: Path, call: Call) -> None:
         ended = call("info", "a\nb\x1b[31m.mcap")

@@ -232,6 +232,10 @@ class TestStrangeYaml:
         (problem,) = problems(tmp_path, TEXT + f"ego: {tag} abcd\n")
         assert problem.startswith("19: ego: tag ")
 
+    def test_half_a_character(self, tmp_path: Path) -> None:
+        """It can be written in YAML, and nowhere else."""
+        assert problems(tmp_path, TEXT + 'ego: "\\ud83d"\n') == ["19: ego: half a character (a surrogate)"]
+
     @pytest.mark.parametrize("tag", ["int", "float", "bool", "null", "timestamp"])
     def test_tag_that_does_not_fit_its_text(self, tmp_path: Path, tag: str) -> None:
         assert experiment(tmp_path, TEXT + f"ego: !!{tag} abcd\n").ego == "abcd"

@@ -146,9 +146,7 @@ def test_the_log_is_an_osi_trace() -> None:
 
 def test_stamps_are_those_of_the_messages(messages: list[GroundTruth]) -> None:
     with LOG.open("rb") as stream:
-        times_ns = [
-            (record.log_time, record.publish_time) for *_, record in make_reader(stream).iter_messages()
-        ]
+        times_ns = [(record.log_time, record.publish_time) for *_, record in make_reader(stream).iter_messages()]
     stamps_ns = [message.timestamp.seconds * 10**9 + message.timestamp.nanos for message in messages]
     assert stamps_ns == [frame * 10**8 for frame in range(81)]
     assert times_ns == [(stamp_ns, stamp_ns) for stamp_ns in stamps_ns]
@@ -170,9 +168,7 @@ def test_who_is_there(messages: list[GroundTruth]) -> None:
         stationary = {osi.id.value: osi for osi in message.stationary_object}
         assert sorted(moving) == [1, 2, 3, 4, 5, 6, 7, 8]
         assert sorted(stationary) == [SHELTER]
-        assert (
-            moving[TRUCK].vehicle_classification.type == MovingObject.VehicleClassification.TYPE_HEAVY_TRUCK
-        )
+        assert moving[TRUCK].vehicle_classification.type == MovingObject.VehicleClassification.TYPE_HEAVY_TRUCK
         pedestrians = [key for key, osi in moving.items() if osi.type == MovingObject.TYPE_PEDESTRIAN]
         assert pedestrians == [PEDESTRIAN, 8]
         for key, osi in {**moving, **stationary}.items():
@@ -273,9 +269,7 @@ def visible_shares(eye: tuple[float, float, float], target: Body, others: list[B
                 if min(distances_m) < face_m:
                     hidden = True
                     edge_m = max(distances_m) if body.height_m < eye[2] else min(distances_m)
-                    covered_m = max(
-                        covered_m, eye[2] - (eye[2] - body.height_m) * face_m / min(edge_m, face_m)
-                    )
+                    covered_m = max(covered_m, eye[2] - (eye[2] - body.height_m) * face_m / min(edge_m, face_m))
             weight = (end - start) / 4 / (high - low)
             flat += weight * (not hidden)
             surface += weight * (1 - min(covered_m / target.height_m, 1.0))
@@ -292,9 +286,7 @@ def test_the_oracle_on_a_scene_to_compute_in_the_head() -> None:
     wall = Body(shapely.box(4, 0, 5, 9), 1.0, 4.5, 4.5, 0.0)
     flat, surface = visible_shares((0, 0, 2.0), target, [wall])
     assert flat == pytest.approx(0.5)  # all that is to the left of the axis is behind the wall
-    assert surface == pytest.approx(
-        1.0
-    )  # … but the eye looks over it: 2 − (2 − 1) · 10 / 5 = 0, down to his feet
+    assert surface == pytest.approx(1.0)  # … but the eye looks over it: 2 − (2 − 1) · 10 / 5 = 0, down to his feet
     flat, surface = visible_shares((0, 0, 3.0), target, [wall._replace(height_m=2.0)])
     assert (flat, surface) == pytest.approx((0.5, 0.75))  # covered up to 3 − (3 − 2) · 10 / 5 = 1 of 2 m
 

@@ -164,9 +164,7 @@ def test_it_rises_strictly_and_stays_within_one(group: list[Person]):
 
 
 @given(people(*CODES), st.randoms(use_true_random=False), st.integers(-3, 3), st.integers(-8, 8))
-def test_order_unit_and_origin_of_time_do_not_matter(
-    group: list[Person], random: Any, power: int, shift: int
-):
+def test_order_unit_and_origin_of_time_do_not_matter(group: list[Person], random: Any, power: int, shift: int):
     times_s, incidence = curve(group)
     shuffled = random.sample(group, len(group))
     time_s, ending = columns(shuffled)
@@ -252,23 +250,17 @@ def test_without_censoring_it_is_the_mean_over_heads(group: list[Person], horizo
 
 
 @given(people(*CODES), st.integers(1, 12))
-def test_with_censoring_it_is_the_mean_over_the_probabilities_of_the_instants(
-    group: list[Person], horizon: int
-):
+def test_with_censoring_it_is_the_mean_over_the_probabilities_of_the_instants(group: list[Person], horizon: int):
     mean, previous = Fraction(0), Fraction(0)
     for instant, (detected, _, _) in product_limit(group).items():
         mean += (detected - previous) * min(instant, horizon)
         previous = detected
     mean += (1 - previous) * horizon
-    assert restricted_mean(*curve(group), horizon * QUARTER_S) == pytest.approx(
-        float(mean) * QUARTER_S, abs=1e-14
-    )
+    assert restricted_mean(*curve(group), horizon * QUARTER_S) == pytest.approx(float(mean) * QUARTER_S, abs=1e-14)
 
 
 @given(people(*CODES), st.floats(0.1, 10.0), st.floats(-5.0, 5.0), st.integers(1, 12))
-def test_a_mean_moves_and_stretches_with_time(
-    group: list[Person], factor: float, shift_s: float, horizon: int
-):
+def test_a_mean_moves_and_stretches_with_time(group: list[Person], factor: float, shift_s: float, horizon: int):
     # A latency moves every detection by exactly itself, and the mean with them.
     times_s, incidence = curve(group)
     horizon_s = horizon * QUARTER_S
@@ -320,16 +312,12 @@ def test_it_is_the_smallest_value_with_enough_rows_at_or_below(distances: list[i
     enough = Fraction(fortieths, 40) * len(distances)
     # None is tried first: it ranks below every value.
     candidates: list[int | None] = [None, *range(7)]
-    expected = next(
-        v for v in candidates if sum(d is None or (v is not None and d <= v) for d in distances) >= enough
-    )
+    expected = next(v for v in candidates if sum(d is None or (v is not None and d <= v) for d in distances) >= enough)
     assert quantile_with_never(values, detected, fortieths / 40) == expected
 
 
 @given(rows, st.integers(1, 40), st.floats(0.01, 100.0))
-def test_a_distance_in_other_units_is_the_same_distance(
-    distances: list[int | None], fortieths: int, factor: float
-):
+def test_a_distance_in_other_units_is_the_same_distance(distances: list[int | None], fortieths: int, factor: float):
     detected = np.array([d is not None for d in distances])
     values = np.array([np.nan if d is None else float(d) for d in distances])
     in_metres = quantile_with_never(values, detected, fortieths / 40)
@@ -456,9 +444,7 @@ def test_over_every_resample_the_limits_are_its_ordered_shares(clusters: list[tu
 
 
 @given(tallies, st.integers(2, 50))
-def test_more_rows_of_the_same_kind_in_each_cluster_teach_nothing(
-    clusters: list[tuple[int, int]], copies: int
-):
+def test_more_rows_of_the_same_kind_in_each_cluster_teach_nothing(clusters: list[tuple[int, int]], copies: int):
     successes, totals = (list(column) for column in zip(*clusters, strict=True))
     uniform = every_resample(len(clusters))
     once = share(successes, totals, uniform, 0.9)

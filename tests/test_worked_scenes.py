@@ -84,7 +84,7 @@ class TestOncomingCar:
         assert earlier["distance_at_detection_m"] == pytest.approx(100.0)
 
     def test_lists_at_a_units_own_rate(self) -> None:
-        """4 Hz from 0.1 s: … 3.85, 4.10: the first list within 60 m is that of 4.1 s, at 59 m; states between frames."""
+        """4 Hz from 0.1 s: … 3.85, 4.10: the first list within 60 m is that of 4.1 s, at 59 m."""
         unit = EGO_UNIT | {"rate_hz": 4.0, "phase_s": 0.1}
         found = row(replayed(scenes.oncoming_car(), units={"ego": unit}), "PEM")
         assert found["detection_s"] == pytest.approx(4.1)

@@ -2,10 +2,10 @@
 
     python tools/lidar_visibility.py LOG.mcap POINTS.csv
 
-prints one JSON line: `n` pedestrian states within 60 m of the ego, the rank correlation of their lidar returns with solid
-angle (height · max(length, width) / distance²) × visible share, and how well the share alone tells states with returns
-from those without (area under the ROC curve), for both kinds of visibility. The sensor stands at the centre of the ego's
-box, 1.9 m above the ground. POINTS.csv: columns `t` (ns), `id`, `pts` (returns inside the box; −1: not known).
+prints one JSON line: `n` pedestrian states within 60 m of the ego, the rank correlation of their lidar returns with
+solid angle (height · max(length, width) / distance²) × visible share, and how well the share alone tells states with
+returns from those without (area under the ROC curve), for both kinds of visibility. The sensor stands at the centre of
+the ego's box, 1.9 m above the ground. POINTS.csv: columns `t` (ns), `id`, `pts` (returns inside the box; −1: unknown).
 """
 
 from __future__ import annotations
