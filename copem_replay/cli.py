@@ -1,6 +1,7 @@
 """The command line: each command a few lines around a library call, and one place where errors become exit codes.
 
-0 done · 1 done, but a log was skipped · 2 the input was wrong: plain lines on stderr · 70 a defect of ours: traceback.
+0 done · 1 done, but a log was skipped · 2 the input was wrong: plain lines on stderr · 70 a defect of ours: traceback ·
+130 interrupted.
 """
 
 from __future__ import annotations

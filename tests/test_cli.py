@@ -761,22 +761,20 @@ class TestFailure:
         self.fails(here, call, arguments, failure)
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
-    @pytest.mark.parametrize("nth", [1, 2])
     def test_while_giving_the_folder_its_name(
-        self, here: Path, call: Call, arguments: list[str], failure: Failure, nth: int, monkeypatch: pytest.MonkeyPatch
+        self, here: Path, call: Call, arguments: list[str], failure: Failure, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        if nth == 2 and "--overwrite" not in arguments:
-            pytest.skip("one step only")
-        replace, count = os.replace, [0]
+        replace = os.replace
+        for step in range(2 if "--overwrite" in arguments else 1):
+            count = iter(range(9))
 
-        def nth_fails(source: Any, target: Any) -> None:
-            count[0] += 1
-            if count[0] == nth:
-                raise failure.error
-            replace(source, target)
+            def fails(source: Any, target: Any, step: int = step, count: Iterator[int] = count) -> None:
+                if next(count) == step:
+                    raise failure.error
+                replace(source, target)
 
-        monkeypatch.setattr(os, "replace", nth_fails)
-        self.fails(here, call, arguments, failure)
+            monkeypatch.setattr(os, "replace", fails)
+            self.fails(here, call, arguments, failure)
 
     def test_termination_is_a_failure_like_any_other(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         previous = signal.getsignal(signal.SIGTERM)

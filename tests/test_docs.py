@@ -14,6 +14,7 @@ from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, parse
 from copem_replay.pem.detection import DetectionModel
 from copem_replay.pem.look import Look
+from copem_replay.run import Result
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -47,6 +48,18 @@ def test_readme_experiment_loads(tmp_path: Path) -> None:
         experiment, problems = parse(load(path))
         assert problems == []
         assert isinstance(experiment, Experiment)
+
+
+def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(ROOT)
+    namespace: dict[str, object] = {"__name__": "page"}
+    exec(code, namespace)
+    result = namespace["result"]
+    assert isinstance(result, Result)
+    assert len(result.table) > 0
+    assert len(result.summary) == 1
 
 
 def test_own_model_of_the_architecture_page_works() -> None:
