@@ -11,6 +11,7 @@ import numpy as np
 
 from copem_replay.experiment import Experiment
 from copem_replay.pem.condition import applies
+from copem_replay.pem.detection import probability_of
 from copem_replay.pem.look import Look
 from copem_replay.resample import at_instants, wrap
 from copem_replay.tracks import VALUES, Float, Int, Scene, Tracks
@@ -174,5 +175,6 @@ def _assess(tracks: Tracks, look: Look, experiment: Experiment) -> tuple[Int, Fl
         for c, couple in enumerate(pem):
             mine = rows[couple_ix[rows] == c]
             if len(mine):
-                probability[mine] = couple.detection.probability(look.take(mine))
+                where = f"pems.{unit.pem}[{c}].detection"
+                probability[mine] = probability_of(couple.detection, look.take(mine), where)
     return couple_ix, probability

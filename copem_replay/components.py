@@ -8,10 +8,11 @@ names it.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+import traceback
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from importlib.metadata import entry_points
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -21,6 +22,10 @@ from pydantic import (
     GetJsonSchemaHandler,
 )
 from pydantic_core import PydanticCustomError, core_schema
+
+from copem_replay.errors import InputError
+
+T = TypeVar("T")
 
 
 class Frozen(BaseModel):
@@ -33,6 +38,18 @@ class Component(Frozen):
     """Base of all components, ours and the users' own."""
 
     kind: str
+
+
+def asked(component: Component, where: str, work: Callable[[], T]) -> T:
+    """What a component answers. Raises InputError where a user's own one fails; a failure of ours stays a defect."""
+    try:
+        return work()
+    except Exception as error:
+        if type(component).__module__.startswith("copem_replay."):
+            raise
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"{where}: {component.kind}: {why} ({place.filename}:{place.lineno})") from error
 
 
 _LARGEST = 1e12

@@ -14,6 +14,7 @@ import numpy as np
 from copem_replay.candidates import Candidates
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.experiment import Experiment
+from copem_replay.pem.error import errors_of
 from copem_replay.resample import wrap
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
 
@@ -78,7 +79,8 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws:
             rows = np.flatnonzero((seen.row_unit_ix == k) & (found.couple_ix == c))
             if couple.error is None or not len(rows):
                 continue
-            errors = couple.error.perturb(found.look.take(rows), partial(draws.normal, rows))
+            where = f"pems.{unit.pem}[{c}].error"
+            errors = errors_of(couple.error, found.look.take(rows), partial(draws.normal, rows), S, where)
             columns["x_m"][:, rows] += errors.east_m
             columns["y_m"][:, rows] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):

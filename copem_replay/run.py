@@ -38,12 +38,14 @@ def run(
     ready = [replays.prepare(recording, experiment) for recording in recordings]
     work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, jobs)]
     parts: list[pd.DataFrame] = []
-    with ThreadPoolExecutor(jobs) as pool:
-        done = pool.map(lambda item: replays.replay_block(item[0], experiment, item[1]), work)
-        for part in done:
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        for part in pool.map(lambda item: replays.replay_block(item[0], experiment, item[1]), work):
             parts.append(part)
             if progress is not None:
                 progress(len(parts), len(work))
+    finally:  # interrupted: what has not begun never does
+        pool.shutdown(cancel_futures=True)
     table = _in_order(pd.concat(parts, ignore_index=True), [r.scene.log for r in ready], experiment)
     rates = [replays.list_rates(replay, experiment) for replay in ready]
     horizon = horizon_s(table, experiment.measure.horizon_s)

@@ -22,7 +22,8 @@ import pytest
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
 from copem_replay.replay import Replay, believed, prepare, replay_block
-from copem_replay.show import ELAPSED, TIME, write_rrd
+from copem_replay.show import write_rrd
+from copem_replay.show.out import ELAPSED, TIME
 from copem_replay.tracks import CLASSES, Tracks
 from scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
@@ -342,7 +343,13 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         if "ViewBlueprint:display_name" in b.schema.names
     ]
     assert sorted(names) == sorted(
-        [*CHANGES["configurations"], *["Visible share", "Position error [m]"] * 2, "Events", "Summary"]
+        [
+            *CHANGES["configurations"],
+            *["Visible share (ego white, any unit grey)", "Position error [m]"] * 2,
+            "Known objects",
+            "Events",
+            "Summary",
+        ]
     )
     fewer = {name: made.beliefs[name] for name in ("GT", "PEM")}
     made.write(tmp_path / "x.rrd", beliefs=fewer)

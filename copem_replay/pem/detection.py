@@ -8,7 +8,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.components import Component, NotNegative, Share
+from copem_replay.components import Component, NotNegative, Share, asked
+from copem_replay.errors import InputError
 from copem_replay.pem.look import Look
 from copem_replay.tracks import Float
 
@@ -19,6 +20,18 @@ class DetectionModel(Component):
     def probability(self, look: Look) -> Float:
         """(P,) probability that each row is listed, 0 … 1."""
         raise NotImplementedError(f"{type(self).__name__} lacks probability(look)")
+
+
+def probability_of(model: DetectionModel, look: Look, where: str) -> Float:
+    """(P,) what a model says, checked. Raises InputError, naming `where` it stands, when it is no probability."""
+    found = asked(model, where, lambda: np.asarray(model.probability(look), dtype=float))
+    expected = (len(look.range_m),)
+    if found.shape != expected:
+        raise InputError(f"{where}: {model.kind}: probability(look): expected shape {expected}, found {found.shape}")
+    wrong = ~((found >= 0) & (found <= 1 + 1e-12))
+    if wrong.any():
+        raise InputError(f"{where}: {model.kind}: probability(look): expected 0 … 1, found {found[wrong][0]}")
+    return found
 
 
 class VisibleShare(DetectionModel):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator
 
-from copem_replay.components import Component, NotNegative, Number
+from copem_replay.components import Component, NotNegative, Number, asked
+from copem_replay.errors import InputError
 from copem_replay.pem.look import Errors, Look, Noise
 from copem_replay.tracks import Float
 
@@ -18,6 +20,26 @@ class ErrorModel(Component):
     def perturb(self, look: Look, noise: Noise) -> Errors:
         """Errors of every row in every run, and their covariance."""
         raise NotImplementedError(f"{type(self).__name__} lacks perturb(look, noise)")
+
+
+def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str) -> Errors:
+    """What a model says, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
+    found = asked(model, where, lambda: model.perturb(look, noise))
+    if not isinstance(found, Errors):
+        raise InputError(f"{where}: {model.kind}: perturb(look, noise): expected Errors, found {type(found).__name__}")
+    n = len(look.range_m)
+    for field in fields(found):
+        values = getattr(found, field.name)
+        if values is None:
+            continue
+        variance = field.name.startswith("cov_") or "_var_" in field.name
+        expected = (n,) if variance else (3, runs, n) if field.name == "size_m" else (runs, n)
+        shape = np.shape(values)
+        if shape != expected:
+            raise InputError(f"{where}: {model.kind}: perturb: {field.name}: expected shape {expected}, found {shape}")
+        if not np.isfinite(values).all():
+            raise InputError(f"{where}: {model.kind}: perturb: {field.name}: expected numbers, found NaN or infinity")
+    return found
 
 
 Pair = tuple[Number, Number]

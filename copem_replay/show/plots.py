@@ -1,0 +1,112 @@
+"""Curves over time: how much of an object is seen, how far off it is believed, how many are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.colours import TRUTH, Rgb
+from copem_replay.experiment import Experiment
+from copem_replay.replay import Replay
+from copem_replay.resample import states_at
+from copem_replay.show.out import Out, by_frame, elapsed_ns, part_of
+from copem_replay.show.world import EGO
+from copem_replay.tracks import Float, Int, Tracks
+from copem_replay.units import carrier
+
+BY_EGO, BY_ANY = "ego", "any unit"
+"""Whose share a curve is: the best of the ego's units, the best of all."""
+
+_LOOKS = {BY_EGO: (EGO, 3.0), BY_ANY: (TRUTH, 1.5)}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Visible share of one object at instants (K,); NaN where no unit has a list of it."""
+
+    elapsed_ns: Int
+    share: Float
+
+
+def share_curves(replay: Replay, experiment: Experiment, object_ix: int) -> dict[str, Curve]:
+    """By whom an object is seen, and how much of it; nobody's curve is left out."""
+    scene, tracks = replay.scene, replay.measured.tracks
+    stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
+    carriers = np.array([carrier(scene, unit) for unit in experiment.units.values()], dtype=np.int64)
+    own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
+    share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
+    rows = np.flatnonzero(tracks.row_object_ix == object_ix)
+    share[tracks.frame_ix[rows]] = replay.measured.look.visible_share[rows]
+    # A unit without a list of the object says nothing about it: the best of the others counts.
+    return {
+        whose: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
+        for whose, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
+        if units.any()
+    }
+
+
+def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
+    """The curves of the object `name`."""
+    import rerun as rr
+
+    for whose, curve in curves.items():
+        known = ~np.isnan(curve.share)
+        # An empty row breaks the line. NaN would, too, but no two recordings with NaN compare equal.
+        kept = known | np.append(False, known[:-1])
+        values = rr.Scalars.columns(scalars=curve.share[known]).partition(known[kept].astype(np.int64))
+        path = ["plots", "visible_share", name, whose]
+        out.columns(path, curve.elapsed_ns[kept], values)
+        colour, width = _LOOKS[whose]
+        out.static(path, rr.SeriesLines(names=whose, colors=colour, widths=width))
+
+
+def _newest_lists(tracks: Tracks, max_gap_s: float) -> tuple[Int, Int]:
+    """All capture instants (K,), and the newest list of each unit at each (U, K): −1, none for `max_gap_s`."""
+    stamps = np.unique(tracks.stamp_ns)
+    newest = np.full((len(tracks.units), len(stamps)), -1)
+    for unit in range(len(tracks.units)):
+        mine = np.flatnonzero(tracks.frame_unit_ix == unit)  # in order of capture
+        at = np.searchsorted(tracks.stamp_ns[mine], stamps, side="right") - 1
+        known = at >= 0
+        known[known] = stamps[known] - tracks.stamp_ns[mine[at[known]]] <= max_gap_s * 1e9
+        newest[unit, known] = mine[at[known]]
+    return stamps, newest
+
+
+def position_errors(
+    out: Out, replay: Replay, experiment: Experiment, name: str, fused: Tracks, shown: Sequence[int], colour: Rgb
+) -> None:
+    """Distance from believed to true position of the shown objects, list by list."""
+    import rerun as rr
+
+    # Points, as an error belongs to one list and to no time between two; no row where there is nothing to measure.
+    style = rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=2.5)
+    for k in shown:
+        rows = np.flatnonzero((fused.row_object_ix == k) & fused.valid[0])
+        frames = fused.frame_ix[rows]
+        at, there = states_at(
+            replay.truth, np.full(len(rows), k), fused.arrives_s[0, frames],
+            t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s,
+        )  # fmt: skip
+        error = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])[there]
+        path = ["plots", "position_error", replay.scene.object_ids[k], name]
+        out.columns(path, elapsed_ns(fused)[frames[there]], rr.Scalars.columns(scalars=error))
+        out.static(path, style)
+
+
+def known(out: Out, replay: Replay, beliefs: Mapping[str, Tracks], colours: Mapping[str, Rgb]) -> None:
+    """How many of all measured objects each configuration's newest list holds, beside how many there are."""
+    import rerun as rr
+
+    lists = [("truth", "truth", replay.truth, TRUTH, 4.0)]
+    lists += [(part_of(name), name, beliefs[name], colour, 1.5) for name, colour in colours.items()]
+    for part, name, tracks, colour, width in lists:
+        _, counts = by_frame(tracks, tracks.valid[0] & np.isin(tracks.row_object_ix, replay.looks.object_ix))
+        changes = np.flatnonzero(np.diff(counts, prepend=-1))  # a step lasts until the next
+        rows = np.union1d(changes, [len(counts) - 1]) if len(counts) else changes
+        path = ["plots", "known", part]
+        out.columns(path, elapsed_ns(tracks)[rows], rr.Scalars.columns(scalars=counts[rows].astype(float)))
+        until_next = rr.components.InterpolationMode.StepAfter
+        out.static(path, rr.SeriesLines(names=name, colors=colour, widths=width, interpolation_mode=until_next))

@@ -1,0 +1,113 @@
+"""The file: everything put together, complete under its name or not there."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import pandas as pd
+
+from copem_replay.colours import configuration_colours
+from copem_replay.errors import OutputError
+from copem_replay.experiment import Experiment
+from copem_replay.replay import Replay
+from copem_replay.show import layout, marks, plots, sight, units, words, world
+from copem_replay.show.out import Out, digest, part_of
+from copem_replay.tracks import Tracks
+
+SHOWN_OBJECTS = 6
+"""How many measured objects have names, lines of sight, marks and plots of their own (chosen)."""
+
+
+def write_rrd(
+    path: Path,
+    replay: Replay,
+    experiment: Experiment,
+    beliefs: Mapping[str, Tracks],
+    table: pd.DataFrame,
+    summary: pd.DataFrame,
+    run: int,
+) -> None:
+    """Write one run of one log. Raises OutputError.
+
+    `beliefs`: per configuration what the receiver believes in this run, a frame per list it issued (one unit, values
+    (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and runs.
+    """
+    import rerun as rr
+
+    shown = [replay.scene.object_number[name] for name in table["object_id"].unique()[:SHOWN_OBJECTS]]
+    blueprint, appearance = layout.blueprint(replay, experiment, table, list(beliefs), shown)
+    identity = digest(experiment.model_dump_json(), replay.scene.log, str(run))
+    strict = rr.strict_mode()
+    rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
+    try:
+        with rr.RecordingStream(f"copem_replay:{appearance}", recording_id=identity, send_properties=False) as rec:
+            if not rr.is_enabled(rec):
+                raise OutputError(f"{path}: not written, Rerun is switched off (RERUN=off in the environment?)")
+            # Not `save`: on a full disk it waits for ever, or leaves half a file and says nothing.
+            memory = rec.memory_recording()
+            rec.send_blueprint(blueprint, make_active=False)
+            _fill(Out(rec, replay.scene.t0_ns), replay, experiment, beliefs, table, summary, run, shown)
+        _replace(path, memory.drain_as_bytes())
+    finally:
+        rr.set_strict_mode(strict)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp") as folder:
+            scratch = Path(folder) / path.name
+            scratch.write_bytes(content)
+            os.replace(scratch, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _fill(
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Tracks], table: pd.DataFrame,
+    summary: pd.DataFrame, run: int, shown: Sequence[int],
+) -> None:  # fmt: skip
+    import rerun as rr
+
+    scene = replay.scene
+    colours = configuration_colours(beliefs)
+    _properties(out, replay, experiment, list(beliefs), run)
+    out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, world.class_colours())
+    world.truth(out, scene, replay.truth, shown)
+    world.statics(out, replay.found.static)
+    units.units(out, replay, experiment)
+    sight.sight(out, replay, experiment, shown)
+    marks.onsets(out, replay, experiment, table, shown)
+    for k in shown:
+        curves = plots.share_curves(replay, experiment, k)
+        plots.visible_share(out, scene.object_ids[k], curves)
+        marks.on_curves(out, replay, experiment, table, scene.object_ids[k], curves, colours)
+    for name, colour in colours.items():
+        world.believed(out, ["world", part_of(name)], scene, beliefs[name], colour)
+        marks.detections(out, replay, experiment, table, name, shown, colour)
+        plots.position_errors(out, replay, experiment, name, beliefs[name], shown, colour)
+        words.events(out, name, table[table["configuration"] == name])
+    if len(replay.looks.object_ix):
+        plots.known(out, replay, beliefs, colours)
+    words.summary(out, replay, experiment, summary, run)
+
+
+def _properties(out: Out, replay: Replay, experiment: Experiment, configurations: list[str], run: int) -> None:
+    import rerun as rr
+
+    out.rec.send_recording_name(f"{replay.scene.log}: run {run}")
+    out.rec.send_recording_start_time_nanos(replay.scene.t0_ns)
+    values = rr.AnyValues(
+        log=replay.scene.log,
+        run=run,
+        seed=experiment.seed,
+        visibility=experiment.visibility,
+        configurations=configurations,
+        copem_replay=version("copem-replay"),
+        rerun_sdk=version("rerun-sdk"),
+    )
+    out.rec.send_property("replay", values)

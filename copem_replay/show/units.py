@@ -1,0 +1,82 @@
+"""The experiment's units: where they are, and the fields of view of their PEMs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from copem_replay.colours import Rgb
+from copem_replay.experiment import Experiment, Unit
+from copem_replay.pem.condition import Condition, Couple
+from copem_replay.replay import Replay
+from copem_replay.show.out import Out, f32, upright
+from copem_replay.show.world import EGO
+from copem_replay.units import Poses, list_instants
+
+MANY_UNITS = 8
+"""With more than these the fixed ones are not named (chosen: twenty names cover the scene)."""
+FIELD: Rgb = (95, 95, 75)
+
+_ARC_STEP_RAD = np.deg2rad(3)  # chosen: a chord of 80 m is 3 cm off the arc
+_ABOVE_GROUND_M = 0.05
+
+
+def units(out: Out, replay: Replay, experiment: Experiment) -> None:
+    """A point and a field of view for each unit; neither while its carrier is absent."""
+    import rerun as rr
+
+    many = len(experiment.units) > MANY_UNITS
+    for name, unit in experiment.units.items():
+        at, path = replay.found.poses[name], ["world", "units", name]
+        place, there = f32(at.x_m, at.y_m, at.z_m), at.present
+        elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
+        if unit.at is not None:
+            out.static(path, rr.Points3D.from_fields(positions=place[:1]))
+        else:
+            out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
+        mark, named = rr.Radius.ui_points(4), not (many and unit.at is not None)
+        out.static(path, rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=named))
+        _field(out, name, unit, at, elapsed_ns, experiment.pems[unit.pem])
+
+
+def outlines(pem: tuple[Couple, ...]) -> list[np.ndarray]:
+    """Borders (K, 2) of where the couples of a PEM apply, ahead along x; none for a couple that ends nowhere."""
+    fields = dict.fromkeys((c.when.range_m, c.when.azimuth_deg) for c in pem)
+    return [border for field in fields for border in _outline(Condition(range_m=field[0], azimuth_deg=field[1]))]
+
+
+def _outline(when: Condition) -> list[np.ndarray]:
+    if when.range_m is None:
+        return []
+    near_m, far_m = when.range_m
+    first, last = np.deg2rad(when.azimuth_deg or (-180.0, 180.0))
+    all_around = last - first >= 2 * np.pi - 1e-9
+    span = 2 * np.pi if all_around else np.mod(last - first, 2 * np.pi)
+    angle = first + np.linspace(0, span, int(np.ceil(span / _ARC_STEP_RAD - 1e-9)) + 1)
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if all_around:
+        return [radius_m * arc for radius_m in (near_m, far_m) if radius_m > 0]
+    inner = near_m * (arc[::-1] if near_m > 0 else arc[:1])
+    return [np.concatenate([inner[-1:], far_m * arc, inner])]
+
+
+def _field(out: Out, name: str, unit: Unit, at: Poses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...]) -> None:
+    """The outlines in the unit's own frame, which moves; on the ground under it."""
+    import rerun as rr
+
+    down_m = _ABOVE_GROUND_M - unit.height_m
+    strips = [f32(*line.T, np.full(len(line), down_m)) for line in outlines(pem)]
+    if not strips or not at.present.any():
+        return
+    path, there = ["world", "fields", name], np.flatnonzero(at.present)
+    place, turn = f32(at.x_m[there], at.y_m[there], at.z_m[there]), upright(at.heading_rad[there])
+    if unit.at is not None:
+        out.static(path, rr.Transform3D.from_fields(translation=place[0], quaternion=turn[0]))
+        out.static(path, rr.LineStrips3D.from_fields(strips=strips))
+    else:
+        out.columns(path, elapsed_ns[there], rr.Transform3D.columns(translation=place, quaternion=turn))
+        # Without a transform it would be drawn at the origin: the outlines come and go with the carrier.
+        changes = np.flatnonzero(np.diff(at.present, prepend=False))
+        comes = at.present[changes]
+        lines = rr.LineStrips3D.columns(strips=strips * int(comes.sum())).partition(len(strips) * comes)
+        out.columns(path, elapsed_ns[changes], lines)
+    out.static(path, rr.LineStrips3D.from_fields(colors=[FIELD], radii=rr.Radius.ui_points(0.75)))

@@ -1,0 +1,89 @@
+"""Models of a user's own: used like ours, and when they fail it is said whose failure it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scenes
+from copem_replay.errors import InputError
+from copem_replay.pem.detection import DetectionModel
+from copem_replay.pem.error import ErrorModel
+from copem_replay.pem.look import Errors, Look, Noise
+from copem_replay.replay import believed, prepare
+from scenes import experiment
+
+
+class NearOnly(DetectionModel):
+    """Seen up to a range, surely."""
+
+    reach_m: float
+
+    def probability(self, look: Look) -> np.ndarray:
+        return (look.range_m <= self.reach_m).astype(float)
+
+
+class Crashes(DetectionModel):
+    def probability(self, look: Look) -> np.ndarray:
+        return look.no_such_thing  # type: ignore[attr-defined, no-any-return]
+
+
+class TooMany(DetectionModel):
+    def probability(self, look: Look) -> np.ndarray:
+        return np.ones(len(look.range_m) + 1)
+
+
+class Percent(DetectionModel):
+    def probability(self, look: Look) -> np.ndarray:
+        return np.full(len(look.range_m), 90.0)
+
+
+class Shifted(ErrorModel):
+    """One metre to the east, always."""
+
+    def perturb(self, look: Look, noise: Noise) -> Errors:
+        zero, n = 0 * noise("east"), len(look.range_m)
+        return Errors(zero + 1.0, zero, np.full(n, 0.01), np.zeros(n), np.full(n, 0.01))
+
+
+class Flat(ErrorModel):
+    def perturb(self, look: Look, noise: Noise) -> Errors:
+        n = len(look.range_m)
+        return Errors(np.zeros(n), np.zeros(n), np.ones(n), np.zeros(n), np.ones(n))
+
+
+def plan(detection: Any, error: Any = None) -> Any:
+    couple = {"detection": detection} | ({"error": error} if error else {})
+    return experiment(pems={"sure": [couple]})
+
+
+def test_own_models_are_used() -> None:
+    log = scenes.oncoming_car()
+    near = plan({"kind": "test_own_models:NearOnly", "reach_m": 30}, {"kind": "test_own_models:Shifted"})
+    ready = prepare(log, near)
+    fused = believed(ready, near, 0)["PEM"].fused
+    first = np.flatnonzero(fused.valid[0])[0]
+    assert fused.arrives_s[0, fused.frame_ix[first]] == pytest.approx(7.0), "30 m away at 7 s"
+    assert fused.x_m[0, first] == pytest.approx(31.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("Crashes", r"AttributeError: .*no_such_thing.*test_own_models\.py:\d+"),
+        ("TooMany", r"expected shape \(81,\), found \(82,\)"),
+        ("Percent", r"expected 0 … 1, found 90"),
+    ],
+)
+def test_a_detection_model_that_fails_is_named(kind: str, said: str) -> None:
+    with pytest.raises(InputError, match=rf"^pems\.sure\[0\]\.detection: test_own_models:{kind}: .*{said}"):
+        prepare(scenes.oncoming_car(), plan({"kind": f"test_own_models:{kind}"}))
+
+
+def test_an_error_model_that_fails_is_named() -> None:
+    wrong = plan({"kind": "constant", "probability": 1.0}, {"kind": "test_own_models:Flat"})
+    ready = prepare(scenes.oncoming_car(), wrong)
+    with pytest.raises(InputError, match=r"^pems\.sure\[0\]\.error: .*east_m: expected shape \(1, 81\), found \(81,\)"):
+        believed(ready, wrong, 0)
