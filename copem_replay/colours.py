@@ -21,5 +21,12 @@ _CYCLE: tuple[Rgb, ...] = (
 
 
 def configuration_colours(configurations: Iterable[str]) -> dict[str, Rgb]:
-    """A colour per configuration, in their order."""
-    return {name: _CYCLE[k % len(_CYCLE)] for k, name in enumerate(configurations)}
+    """A colour per configuration, in their order; past the seventh paler, then darker ones."""
+    return {name: _shade(_CYCLE[k % len(_CYCLE)], k // len(_CYCLE)) for k, name in enumerate(configurations)}
+
+
+def _shade(colour: Rgb, lap: int) -> Rgb:
+    towards = 255 if lap % 2 else 0
+    share = 0.55 * (1 - 0.5 ** ((lap + 1) // 2)) if lap else 0.0
+    red, green, blue = (round(c + (towards - c) * share) for c in colour)
+    return red, green, blue

@@ -19,11 +19,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from copem_replay.colours import configuration_colours
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
 from copem_replay.replay import Replay, believed, prepare, replay_block
 from copem_replay.show import write_rrd
 from copem_replay.show.out import ELAPSED, TIME
+from copem_replay.show.recording import latest_known
 from copem_replay.tracks import CLASSES, Tracks
 from scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
@@ -420,3 +422,20 @@ def test_at_most_forty_bytes_a_box(tmp_path: Path) -> None:
     boxes = len(made.replay.truth.frame_ix) + sum(int(tracks.valid.sum()) for tracks in made.beliefs.values())
     assert boxes > 70_000
     assert made.path.stat().st_size <= 40 * boxes
+
+
+def test_of_many_objects_those_known_last_are_shown() -> None:
+    table = pd.DataFrame(
+        {
+            "object_id": ["a", "b", "c", "d", "a", "b", "c", "d"],
+            "time_to_detection_s": [0.0, 1.0, 5.0, 0.5, 0.2, None, 0.0, 0.5],
+        }
+    )
+    assert latest_known(table, 2) == ["b", "c"], "b was never known once, c after 5 s"
+    assert latest_known(table, 9) == ["a", "b", "c", "d"]
+
+
+def test_colours_do_not_repeat() -> None:
+    colours = configuration_colours([str(k) for k in range(28)])
+    assert len(set(colours.values())) == 28
+    assert all(0 <= c <= 255 for colour in colours.values() for c in colour)

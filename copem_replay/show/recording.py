@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from copem_replay.colours import configuration_colours
@@ -38,7 +39,7 @@ def write_rrd(
     """
     import rerun as rr
 
-    shown = [replay.scene.object_number[name] for name in table["object_id"].unique()[:SHOWN_OBJECTS]]
+    shown = [replay.scene.object_number[name] for name in latest_known(table, SHOWN_OBJECTS)]
     blueprint, appearance = layout.blueprint(replay, experiment, table, list(beliefs), shown)
     identity = digest(experiment.model_dump_json(), replay.scene.log, str(run))
     strict = rr.strict_mode()
@@ -54,6 +55,14 @@ def write_rrd(
         _replace(path, memory.drain_as_bytes())
     finally:
         rr.set_strict_mode(strict)
+
+
+def latest_known(table: pd.DataFrame, most: int) -> list[str]:
+    """Ids of the objects that some configuration was last to know (never counts as last), in the table's order."""
+    time_s = table["time_to_detection_s"].fillna(np.inf)
+    worst = time_s.groupby(table["object_id"], sort=False).max()
+    chosen = set(worst.sort_values(ascending=False, kind="stable").index[:most])
+    return [name for name in worst.index if name in chosen]
 
 
 def _replace(path: Path, content: bytes) -> None:
