@@ -52,7 +52,12 @@ def test_lidar_visibility_says_what_is_wrong() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "keys"), [("paper", {"paper_draw_ratio"}), ("writing", {"mcap_objects_per_s", "rrd_boxes_per_s"})]
+    ("name", "keys"),
+    [
+        ("paper", {"paper_draw_ratio"}),
+        ("reading", {"read_ratio"}),
+        pytest.param("writing", {"mcap_objects_per_s", "rrd_boxes_per_s"}, marks=pytest.mark.long),
+    ],
 )
 def test_benchmarks_print_json_lines(name: str, keys: set[str], capsys: pytest.CaptureFixture[str]) -> None:
     bench.main([name])
