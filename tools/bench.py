@@ -109,7 +109,7 @@ def reading() -> Iterator[dict[str, object]]:
 
 
 def writing() -> Iterator[dict[str, object]]:
-    """Objects per second into MCAP (lists, scenes, details), boxes per second and bytes per box into .rrd: the crossing."""
+    """The crossing: objects per second into MCAP, boxes per second and bytes per box into .rrd."""
     from copem_replay.show import write_rrd
     from copem_replay.summary import horizon_s, summary
     from copem_replay.write import write_mcap
