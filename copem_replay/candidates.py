@@ -93,6 +93,11 @@ def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidate
     )
     look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
     couple_ix, probability = _assess(tracks, look, experiment)
+    for k, name in enumerate(experiment.units):
+        if not (tracks.frame_unit_ix == k).any():
+            notes.append(f"unit {name}: makes no list, its carrier is never there")
+        elif not (couple_ix[tracks.row_unit_ix == k] >= 0).any():
+            notes.append(f"unit {name}: no object ever meets a condition of its PEM {experiment.units[name].pem!r}")
     return Candidates(tracks, look, couple_ix, probability, unit_poses, static, tuple(notes))
 
 

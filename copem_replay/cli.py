@@ -53,7 +53,10 @@ def info(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Recordings (MCAP).")],
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, one array.")] = False,
 ) -> int:
-    """What is in a recording: topics, object lists, objects, span, rate, ego vehicle, what is missing."""
+    """What is in a recording: topics, object lists, objects, span, rate, ego vehicle, what is missing.
+
+    Ends 0 when at least one object list could be read, else 2.
+    """
     import json
 
     from copem_replay.info import describe, survey
@@ -68,9 +71,14 @@ def info(
 
 
 @app.command()
-def check(experiment: ExperimentFile) -> int:
+def check(
+    experiment: ExperimentFile,
+    log: Annotated[list[Path] | None, typer.Option(help="Check against this recording instead of those named.")] = None,
+    ego: Annotated[str | None, typer.Option(metavar="ID", help="Object that is the ego vehicle.")] = None,
+) -> int:
     """Every problem of an experiment file at once, with file and line, against its logs too."""
-    _experiment, recordings, _skipped = _ready(_source(experiment, {}, []), skip_unreadable=False)
+    source = _source(experiment, {} if ego is None else {"ego": ego}, log or [])
+    _experiment, recordings, _skipped = _ready(source, skip_unreadable=False)
     print(_printable(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in recordings)}"))
     return 0
 
@@ -123,7 +131,10 @@ def view(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results fol
     # The module, not the script: it is there in every environment that has rerun-sdk, whatever the PATH.
     code = subprocess.call([sys.executable, "-m", "rerun", *map(str, files)])
     if code:
-        raise OutputError(f"{folder}: the Rerun viewer could not be opened (it ended with {code})")
+        raise OutputError(
+            f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, copy "
+            f"{files[0].name} to a desktop and open it there: rerun {files[0].name}"
+        )
     return 0
 
 
@@ -149,6 +160,7 @@ def _source(path: Path, changes: dict[str, Any], logs: Sequence[Path]) -> Any:
 
     source = load(path)
     source.data.update(changes)
+    source = replace(source, options=frozenset(changes))
     if not logs:
         return source
     source.data["logs"] = [str(log) for log in logs]

@@ -122,9 +122,13 @@ class Slot:
             component = getattr(importlib.import_module(module), name)
         except Exception as error:  # whatever a module of the user's raises
             why = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            raise _problem(f"kind: {kind!r} cannot be imported: {why}") from error
+            raise _problem(
+                f"kind: {kind!r} cannot be imported: {why} (install it, or name its folder in PYTHONPATH)"
+            ) from error
         if not (isinstance(component, type) and issubclass(component, self.base)) or component is self.base:
-            raise _problem(f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}")
+            raise _problem(
+                f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}; derive it from that"
+            )
         return component
 
     def build(self, value: object) -> Component:

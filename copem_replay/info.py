@@ -14,7 +14,7 @@ from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
 from copem_replay.read import Recording, choose_topic, is_truth, moving_ids, read_log, truth_topics
 from copem_replay.repair import MAX_GAP_S
-from copem_replay.tracks import CLASSES, Bool, Scene
+from copem_replay.tracks import CLASSES, Bool, Float, Scene
 from copem_replay.wording import counted
 
 _ROLES = {
@@ -91,6 +91,8 @@ def _truth(recording: Recording) -> dict[str, Any]:
         "longest_gap_s": round(float(between_s[longest]), 9) if len(between_s) else None,
         "longest_gap_at_s": round(float(truth.captured_s[longest]), 9) if len(between_s) else None,
         "gaps_inside_tracks": int((inside_s > MAX_GAP_S).sum()),
+        "x_m": _extent(truth.x_m[0]),
+        "y_m": _extent(truth.y_m[0]),
         "moving": _by_class(scene, scene.moving),
         "stationary": _by_class(scene, ~scene.moving),
         "host_id": recording.host_id,
@@ -99,6 +101,11 @@ def _truth(recording: Recording) -> dict[str, Any]:
         "damage": recording.damage,
         "notes": list(recording.notes),
     }
+
+
+def _extent(values: Float) -> list[float]:
+    """From where to where the centres of the boxes lie."""
+    return [round(float(values.min()), 1), round(float(values.max()), 1)]
 
 
 def _by_class(scene: Scene, which: Bool) -> dict[str, int]:
@@ -150,6 +157,8 @@ def _truth_lines(truth: dict[str, Any]) -> list[str]:
         span += f", {truth['rate_hz']:.2f} Hz (median)"
         span += f", longest gap {truth['longest_gap_s']:.3f} s at {truth['longest_gap_at_s']:.3f} s"
     lines.append(span)
+    (x0, x1), (y0, y1) = truth["x_m"], truth["y_m"]
+    lines.append(f"  within x {x0:g} … {x1:g} m, y {y0:g} … {y1:g} m")
     if truth["gaps_inside_tracks"]:
         lines.append(f"  {counted(truth['gaps_inside_tracks'], 'gap')} above {MAX_GAP_S:g} s inside tracks")
     for kind in ("moving", "stationary"):

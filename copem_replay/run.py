@@ -11,10 +11,12 @@ import numpy as np
 import pandas as pd
 
 from copem_replay import replay as replays
-from copem_replay.experiment import Experiment
+from copem_replay.experiment import At, Experiment
+from copem_replay.onset import measured_objects
 from copem_replay.read import Recording
 from copem_replay.replay import Replay
 from copem_replay.summary import horizon_s, summary
+from copem_replay.tracks import CLASSES, TRUTH
 
 Progress = Callable[[int, int], None]
 """`progress(done, total)`, called after each block of runs."""
@@ -57,7 +59,7 @@ def run(
         horizon_s=horizon,
     )
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
-    notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay)]
+    notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
     return Result(table, rows, (*notes, *said), tuple(ready), horizon)
 
 
@@ -74,10 +76,23 @@ def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:
     return count / span_s if span_s > 0 else None
 
 
-def _notes(replay: Replay) -> list[str]:
+def _notes(replay: Replay, experiment: Experiment) -> list[str]:
+    """What is odd about a log and an experiment together."""
     notes = list(replay.found.notes)
-    if not len(replay.looks.object_ix):
-        notes.append("no measured object has an onset: no rows")
+    scene, measure = replay.scene, experiment.measure
+    if not len(measured_objects(scene, measure)):
+        there = sorted({CLASSES[k] for k in scene.object_class})
+        wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
+        notes.append(f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}")
+    elif isinstance(measure.onset, At) and measure.onset.time_s > scene.end_s:
+        notes.append(f"no rows: the onset at {measure.onset.time_s:g} s lies after the log's end, {scene.end_s:g} s")
+    elif not len(replay.looks.object_ix):
+        notes.append(f"no rows: no measured object has an onset ({measure.onset.kind})")
+    for name, configuration in experiment.configurations.items():
+        units = experiment.units_of(configuration) or (TRUTH,)
+        late = [unit for unit in units if configuration.latency_of(unit) > scene.end_s]
+        if late:
+            notes.append(f"configuration {name}: the latency of {', '.join(late)} is longer than the log")
     return notes
 
 

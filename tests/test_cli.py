@@ -356,12 +356,43 @@ class TestRun:
         (here / "e.yaml").write_text(changed("measure: {onset: {kind: in_range, range_m: 1}}"))
         ended = call("run", "e.yaml")
         assert ended.code == 0
-        assert ended.lines == ["note: drive: no measured object has an onset: no rows"]
+        assert ended.lines == ["note: drive: no rows: no measured object has an onset (in_range)"]
         found = table(here / "out/e")
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
         assert ended.out.splitlines()[1].split() == ["GT", "0", "10", "–", "–", "–", "–", "–", "–", "–"]
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            (
+                "measure: {objects: {classes: [truck]}}",
+                "note: drive: no rows: nothing to measure (truck); the log has car",
+            ),
+            (
+                "measure: {onset: {kind: at, time_s: 99}}",
+                "note: drive: no rows: the onset at 99 s lies after the log's end, ",
+            ),
+        ],
+    )
+    def test_why_there_is_no_row(self, here: Path, call: Call, change: str, said: str) -> None:
+        (here / "e.yaml").write_text(changed(change))
+        ended = call("run", "e.yaml")
+        assert ended.code == 0
+        assert any(line.startswith(said) for line in ended.lines), ended.lines
+
+    def test_what_can_hardly_be_meant_is_said(self, here: Path, call: Call) -> None:
+        """Radians for degrees, a latency in milliseconds."""
+        text = (here / "e.yaml").read_text().replace("\n  PEM: {", "\n  late: {units: all, latency_s: 250}\n  PEM: {")
+        assert "latency_s: 250" in text
+        (here / "e.yaml").write_text(text)
+        lines = call("run", "e.yaml").lines
+        assert any("configuration late: the latency of ego" in line for line in lines), lines
+        narrow = TEXT.replace("range_m: [0, 80]", "azimuth_deg: [-0.001, 0.001], range_m: [1, 2]")
+        (here / "e.yaml").write_text(narrow)
+        lines = call("run", "e.yaml", "--overwrite").lines
+        assert "note: drive: unit ego: no object ever meets a condition of its PEM 'onboard'" in lines
 
     def test_nothing_is_cut_off_or_wrapped(self, here: Path, call: Call) -> None:
         name = "a very long name of a configuration " * 5
@@ -429,7 +460,7 @@ class TestOptions:
     def test_too_many_runs(self, here: Path, call: Call) -> None:
         ended = call("run", "e.yaml", "--runs", "1" + "0" * 30)
         assert ended.code == 2
-        assert ended.lines == ["e.yaml:3: runs: expected at most 1e+09, found 1" + "0" * 30]
+        assert ended.lines == ["--runs: expected at most 1e+09, found 1" + "0" * 30]
 
     @pytest.mark.parametrize("seed", ["-5", "0", "123456789012345678901234567890"])
     def test_seed(self, here: Path, call: Call, seed: str) -> None:
@@ -448,7 +479,7 @@ class TestOptions:
     @pytest.mark.parametrize("ego", ["9", "3", ""])
     def test_ego_that_is_not_there(self, here: Path, call: Call, ego: str) -> None:
         ended = call("run", "e.yaml", "--ego", ego)
-        assert ended == (2, "", [f"e.yaml:1: ego: drive.mcap: no moving object {ego!r}; there are 1 (car), 2 (car)"])
+        assert ended == (2, "", [f"--ego: drive.mcap: no moving object {ego!r}; there are 1 (car), 2 (car)"])
 
     def test_no_ego(self, here: Path, call: Call) -> None:
         drive(here / "drive.mcap", host=None)
@@ -842,7 +873,9 @@ class TestView:
         (tmp_path / "replay.rrd").touch()
         monkeypatch.setenv("VIEWER_ENDS", "3")
         ended = call("view", ".")
-        assert ended == (2, "", [".: the Rerun viewer could not be opened (it ended with 3)"])
+        assert ended.code == 2
+        (line,) = ended.lines
+        assert line.startswith(".: the Rerun viewer could not be opened (it ended with 3); without a display, copy ")
 
     @pytest.mark.parametrize(
         ("folder", "said"),
