@@ -14,7 +14,7 @@ from copem_replay.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, F
 from copem_replay.wording import counted
 
 FARTHEST_M = 1e7  # a coordinate beyond is no position (chosen; UTM northings end at 1e7)
-LONGEST_M = 200.0  # nothing on a road is longer or wider (chosen)
+LONGEST_M = 1000.0  # no wall, train or building is longer, wider or higher (chosen)
 _X, _Y, _Z, _YAW, _VX, _VY, _LENGTH, _WIDTH, _HEIGHT = range(len(VALUES))
 
 
@@ -81,6 +81,9 @@ def _usable(values: Float, kept: Bool, notes: list[str]) -> Bool:
             "whose yaw is no number": ~np.isfinite(values[:, _YAW]),
             f"whose length or width is not between 0 and {LONGEST_M:g} m": ~((size > 0.0) & (size <= LONGEST_M)).all(
                 axis=1
+            ),
+            f"whose height is negative, above {LONGEST_M:g} m or no number": ~(
+                (values[:, _HEIGHT] >= 0.0) & (values[:, _HEIGHT] <= LONGEST_M)
             ),
         }
     for what, rows in defects.items():

@@ -8,6 +8,7 @@ names it.
 from __future__ import annotations
 
 import importlib
+import inspect
 import traceback
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -129,6 +130,9 @@ class Slot:
             raise _problem(
                 f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}; derive it from that"
             )
+        if inspect.isabstract(component):
+            lacking = ", ".join(sorted(vars(component)["__abstractmethods__"]))
+            raise _problem(f"kind: {kind!r} lacks {lacking}")
         return component
 
     def build(self, value: object) -> Component:

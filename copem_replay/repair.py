@@ -72,12 +72,11 @@ def heights(
 ) -> tuple[Float, Float, list[str]]:
     """Heights of centres and of boxes (P,), and notes; all columns are (P,).
 
-    A height below the least plausible one of its class, or none (NaN, 0), becomes the typical one; the bottom
+    A height below the least plausible one of its class, or none (0), becomes the typical one; the bottom
     of the box stays. Boxes all centred on z = 0 are stood on it.
     """
     notes = []
-    height = np.where(np.isfinite(height_m) & (height_m > 0.0), height_m, 0.0)
-    z = z_m
+    height, z = height_m, z_m
     if not z.any() and len(np.unique(height)) > 1:
         z = height / 2.0
         notes.append("every box is centred on z = 0: stood on z = 0")

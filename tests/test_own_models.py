@@ -87,3 +87,12 @@ def test_an_error_model_that_fails_is_named() -> None:
     ready = prepare(scenes.oncoming_car(), wrong)
     with pytest.raises(InputError, match=r"^pems\.sure\[0\]\.error: .*east_m: expected shape \(1, 81\), found \(81,\)"):
         believed(ready, wrong, 0)
+
+
+class Forgotten(DetectionModel):
+    """Lacks its method."""
+
+
+def test_a_model_without_its_method_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"test_own_models:Forgotten' lacks probability"):
+        plan({"kind": "test_own_models:Forgotten"})

@@ -421,8 +421,11 @@ def test_unusable_states_are_skipped_by_reason(path):
         Obj(id=6, yaw=nan),
         Obj(id=7, length=0),
         Obj(id=8, width=-1),
-        Obj(id=9, length=201),
+        Obj(id=9, length=1001),
         Obj(id=10, width=nan),
+        Obj(id=11, height=nan),
+        Obj(id=12, height=-1.5),
+        Obj(id=13, height=5000),
     ]
     write_recording(path, [(0, [*bad, good])])
     recording = read(path, name="log")
@@ -432,7 +435,8 @@ def test_unusable_states_are_skipped_by_reason(path):
         "3 object states without a position, or with one that is no number: skipped",
         "1 object state farther than 1e+07 m from the origin: skipped",
         "1 object state whose yaw is no number: skipped",
-        "4 object states whose length or width is not between 0 and 200 m: skipped",
+        "4 object states whose length or width is not between 0 and 1000 m: skipped",
+        "3 object states whose height is negative, above 1000 m or no number: skipped",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
@@ -14,12 +15,12 @@ from copem_replay.pem.look import Look
 from copem_replay.tracks import Float
 
 
-class DetectionModel(Component):
+class DetectionModel(Component, ABC):
     """Base of detection models."""
 
+    @abstractmethod
     def probability(self, look: Look) -> Float:
         """(P,) probability that each row is listed, 0 … 1."""
-        raise NotImplementedError(f"{type(self).__name__} lacks probability(look)")
 
 
 def probability_of(model: DetectionModel, look: Look, where: str) -> Float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import fields
 from typing import Annotated, Literal
 
@@ -14,12 +15,12 @@ from copem_replay.pem.look import Errors, Look, Noise
 from copem_replay.tracks import Float
 
 
-class ErrorModel(Component):
+class ErrorModel(Component, ABC):
     """Base of error models."""
 
+    @abstractmethod
     def perturb(self, look: Look, noise: Noise) -> Errors:
         """Errors of every row in every run, and their covariance."""
-        raise NotImplementedError(f"{type(self).__name__} lacks perturb(look, noise)")
 
 
 def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str) -> Errors:
