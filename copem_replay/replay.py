@@ -25,6 +25,9 @@ from copem_replay.transmit import transmit
 ROWS_TIMES_RUNS = 50_000_000
 """How many row × run cells a block may hold (chosen: a byte each while only detections are drawn)."""
 
+WORTH_A_BLOCK = 1_000_000
+"""Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -49,7 +52,10 @@ def prepare(recording: Recording, experiment: Experiment) -> Replay:
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
     """The runs cut into blocks, small enough for memory and enough of them for the workers."""
     rows = max(len(replay.measured.tracks.frame_ix), 1)
-    size = max(1, min(ROWS_TIMES_RUNS // rows, -(-experiment.runs // jobs)))
+    even = -(-experiment.runs // jobs)
+    # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
+    small = max(-(-even // 8), WORTH_A_BLOCK // rows)
+    size = max(1, min(ROWS_TIMES_RUNS // rows, even, small))
     return [np.arange(k, min(k + size, experiment.runs)) for k in range(0, experiment.runs, size)]
 
 
