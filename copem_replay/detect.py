@@ -54,19 +54,21 @@ def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool
 
 
 def capture_instants(heard: Tracks) -> Int:
-    """(F,) the capture instant each list belongs to, counted from the first.
+    """(F,) the capture instant each list belongs to, counted from the first; 0 for lists that never arrive.
 
     Captures of several units within half the shortest list period of the first one are one instant; two captures of
     one unit never are.
     """
     periods = []
-    for unit in np.unique(heard.frame_unit_ix):
-        mine = np.flatnonzero(heard.frame_unit_ix == unit)
+    came = np.isfinite(heard.arrives_s[0])  # what never arrives is no capture to the receiver
+    for unit in np.unique(heard.frame_unit_ix[came]):
+        mine = np.flatnonzero((heard.frame_unit_ix == unit) & came)
         if len(mine) > 1:
             periods.append(float(np.median(np.diff(heard.captured_s[mine]))))
     reach_s = min(periods, default=0.0) / 2 + _TOLERANCE_S
-    order = np.argsort(heard.captured_s, kind="stable")
-    cluster = np.zeros(len(order), dtype=np.int64)
+    order = np.flatnonzero(came)
+    order = order[np.argsort(heard.captured_s[order], kind="stable")]
+    cluster = np.zeros(len(came), dtype=np.int64)
     _cluster(heard.captured_s, heard.frame_unit_ix, np.full(len(heard.units), -1), reach_s, order, cluster)
     return cluster
 

@@ -77,10 +77,14 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
 
 
 def listen(seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration) -> Tracks:
-    """What reaches the receiver in one configuration: the lists of its units, late."""
-    if configuration.units == "truth":
+    """What reaches the receiver in one configuration: the lists of its units, late; those of the others never.
+
+    Nothing is copied: configurations share the rows, and what was drawn for them.
+    """
+    if configuration.units == TRUTH:
         return transmit(truth, configuration.latency_of)
-    return transmit(seen.take_units(experiment.units_of(configuration)), configuration.latency_of)
+    heard = experiment.units_of(configuration)
+    return transmit(seen, lambda unit: configuration.latency_of(unit) if unit in heard else np.inf)
 
 
 def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
@@ -95,8 +99,7 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Beli
         heard = listen(seen, replay.truth, experiment, configuration)
         belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
         if configuration.units != TRUTH:
-            mine = np.isin(replay.found.tracks.row_unit_ix, [seen.units.index(unit) for unit in heard.units])
-            belief = replace(belief, look=replay.found.look.take(np.flatnonzero(mine)))
+            belief = replace(belief, look=replay.found.look)
         result[name] = draw_posterior(belief, replay.scene, experiment.seed, runs) if posterior else belief
     return result
 

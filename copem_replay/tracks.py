@@ -187,25 +187,6 @@ class Tracks:
             **columns,
         )
 
-    def take_units(self, names: tuple[str, ...]) -> Tracks:
-        """Only the units of `names`, their tracks and their lists, in the order they have here."""
-        kept = np.array([name in names for name in self.units])
-        if kept.all():
-            return self
-        tracks = self.take_tracks(kept[self.unit_ix])
-        frames = kept[self.frame_unit_ix]
-        unit_number, frame_number = np.cumsum(kept) - 1, np.cumsum(frames) - 1
-        return replace(
-            tracks,
-            units=tuple(name for name in self.units if name in names),
-            unit_ix=unit_number[tracks.unit_ix],
-            frame_ix=frame_number[tracks.frame_ix],
-            stamp_ns=self.stamp_ns[frames],
-            captured_s=self.captured_s[frames],
-            frame_unit_ix=unit_number[self.frame_unit_ix[frames]],
-            arrives_s=self.arrives_s[:, frames],
-        )
-
 
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
 UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)

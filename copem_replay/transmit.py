@@ -11,6 +11,6 @@ from copem_replay.tracks import Tracks
 
 
 def transmit(seen: Tracks, latency_of: Callable[[str], float]) -> Tracks:
-    """The same tracks with the arrival times of their lists: `latency_of(unit's name)` in seconds."""
+    """The same tracks with the arrival times of their lists: `latency_of(unit's name)` in seconds, inf: never."""
     latency_s = np.array([latency_of(name) for name in seen.units] or [0.0])
     return replace(seen, arrives_s=(seen.captured_s + latency_s[seen.frame_unit_ix])[None])

@@ -188,18 +188,8 @@ def test_take_tracks(seen: Seen, data: st.DataObject) -> None:
     assert len(taken.unit_ix) == len(kept)
 
 
-@settings(deadline=None)
-@given(seen_by_units, st.lists(st.sampled_from(["mast", "van", "ego", "bike", "nobody"]), unique=True))
-def test_take_units(seen: Seen, names: list[str]) -> None:
-    of = tracks(seen, exact=("size_var_m2", "speed_var_m2ps2"))
-    taken = of.take_units(tuple(names))
-    assert taken.units == tuple(name for name in seen if name in names), "in the order they have here"
-    assert lists(taken) == [entry for entry in lists(of) if entry["unit"] in names]
-
-
 def test_taking_leaves_the_original_alone() -> None:
     of, same = tracks(SEEN), tracks(SEEN)
-    of.take_units(("van",))
     of.take_tracks(np.arange(len(of.unit_ix)) % 2 == 0)
     assert lists(of) == lists(same)
 
