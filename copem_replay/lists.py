@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from copem_replay import container
 from copem_replay.errors import RecordingError
@@ -35,21 +36,33 @@ class _Rows:
 def read_lists(path: Path, topic: str, scene: Scene) -> Tracks:
     """The lists on `topic`, their objects told by the ids of `scene` (−1 where the list names no object of it).
 
-    Raises RecordingError when there is no such topic of osi3.SensorData.
+    Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
     log = container.open_log(path)
+    try:
+        return _read(log, topic, scene)
+    except container.BrokenIndexError as error:
+        return _read(container.from_start(path, error.__cause__, log.channels), topic, scene)
+
+
+def _read(log: container.Log, topic: str, scene: Scene) -> Tracks:
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == sensor_data.SCHEMA}
     if not chosen:
         there = sorted(c.topic for c in log.channels if c.schema == sensor_data.SCHEMA)
-        raise RecordingError(f"{path}: no {sensor_data.SCHEMA} on topic {topic!r}; it is on {there or 'none'}")
-    beside = {c.number for c in log.channels if c.topic == f"{topic.removesuffix('/objects')}/detail"}
+        raise RecordingError(f"{log.path}: no {sensor_data.SCHEMA} on topic {topic!r}; it is on {there or 'none'}")
+    detail_topic = f"{topic.removesuffix('/objects')}/detail"
+    beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == detail.SCHEMA}
     rows, details = _Rows(), {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
             content = detail.parse(payload)
             details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
         else:
-            _add(rows, sensor_data.message_class().FromString(payload), log_time_ns)
+            try:
+                message = sensor_data.message_class().FromString(payload)
+            except DecodeError as error:
+                raise RecordingError(f"{log.path}: {topic}: a message cannot be decoded: {error}") from None
+            _add(rows, message, log_time_ns)
     return _tracks(rows, details, topic, scene)
 
 

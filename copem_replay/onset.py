@@ -15,7 +15,7 @@ from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Appears, At, Experiment, InRange, LineOfSight, Measure, StartsMoving
 from copem_replay.resample import states_at, wrap
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
-from copem_replay.units import carrier, observers, poses, unit_ground
+from copem_replay.units import carrier, moved, observers, poses, unit_ground
 from copem_replay.visibility import Statics, visible_shares
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
@@ -77,19 +77,12 @@ def reference_at(scene: Scene, truth: Tracks, experiment: Experiment, time_s: Fl
     unit = experiment.units[name]
     point = np.zeros(n)
     if unit.at is not None:
-        x, y = (np.full(n, v) for v in unit.at)
-        return Reference(x, y, np.full(n, np.deg2rad(unit.yaw_deg)), point, point, np.ones(n, dtype=bool))
+        heading = np.full(n, np.deg2rad(unit.yaw_deg))
+        x, y = moved(np.full(n, unit.at[0]), np.full(n, unit.at[1]), heading, unit.offset_m)
+        return Reference(x, y, heading, point, point, np.ones(n, dtype=bool))
     at, present = _state(scene, truth, carrier(scene, unit), time_s, experiment.max_gap_s)
-    cos, sin = np.cos(at["yaw_rad"]), np.sin(at["yaw_rad"])
-    forward, left = unit.offset_m
-    return Reference(
-        at["x_m"] + cos * forward - sin * left,
-        at["y_m"] + sin * forward + cos * left,
-        wrap(at["yaw_rad"] + np.deg2rad(unit.yaw_deg)),
-        point,
-        point,
-        present,
-    )
+    x, y = moved(at["x_m"], at["y_m"], at["yaw_rad"], unit.offset_m)
+    return Reference(x, y, wrap(at["yaw_rad"] + np.deg2rad(unit.yaw_deg)), point, point, present)
 
 
 def _state(

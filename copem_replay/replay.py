@@ -5,6 +5,7 @@ function of it, so that blocks can be computed anywhere, in any order, by any nu
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -91,12 +92,14 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Beli
     """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
     runs = np.array([run])
     ego = replay.scene.ego_ix
-    sampled = perceive(replay.scene, replay.found, experiment, runs)
+    seen: dict[bool, Tracks] = {}  # by whether the states are the expected ones; each is made when first needed
     result = {}
     for name, configuration in experiment.configurations.items():
         posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
-        seen = perceive(replay.scene, replay.found, experiment, runs, states="expected") if posterior else sampled
-        heard = listen(seen, replay.truth, experiment, configuration)
+        if posterior not in seen:
+            states: Literal["expected", "sampled"] = "expected" if posterior else "sampled"
+            seen[posterior] = perceive(replay.scene, replay.found, experiment, runs, states=states)
+        heard = listen(seen[posterior], replay.truth, experiment, configuration)
         belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
         if configuration.units != TRUTH:
             belief = replace(belief, look=replay.found.look)

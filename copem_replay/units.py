@@ -45,6 +45,7 @@ def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
     if unit.at is not None:
         heading = np.full(n, wrap(np.deg2rad(np.array(unit.yaw_deg))))
         x, y, z = (np.full(n, v) for v in (*unit.at, ground_m))
+        x, y = moved(x, y, heading, unit.offset_m)
         present = np.ones(n, dtype=bool)
     else:
         x, y, z, yaw = (np.full(n, np.nan) for _ in range(4))
@@ -54,11 +55,16 @@ def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
         present[at] = True
         x[at], y[at], yaw[at] = world.x_m[0, rows], world.y_m[0, rows], world.yaw_rad[0, rows]
         z[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2
-        forward, left = unit.offset_m
-        x = x + np.cos(yaw) * forward - np.sin(yaw) * left
-        y = y + np.sin(yaw) * forward + np.cos(yaw) * left
+        x, y = moved(x, y, yaw, unit.offset_m)
         heading = wrap(yaw + np.deg2rad(unit.yaw_deg))
     return Poses(x, y, z + unit.height_m, heading, present)
+
+
+def moved(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[float, float]) -> tuple[Float, Float]:
+    """Places (K,) moved forward and to the left of their headings."""
+    forward, left = offset_m
+    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+    return x_m + cos * forward - sin * left, y_m + sin * forward + cos * left
 
 
 def observers(places: Sequence[Poses], carriers: Int) -> Observers:

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import heapq
 import json
-import os
-import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,8 @@ import pandas as pd
 from mcap.records import Message
 from mcap.writer import Writer
 
+from copem_replay.atomic import atomic_file
 from copem_replay.colours import configuration_colours
-from copem_replay.errors import OutputError
 from copem_replay.formats import detail, foxglove, sensor_data
 from copem_replay.fusion.ideal import Belief
 from copem_replay.passthrough import Catalogue, Original
@@ -145,25 +143,8 @@ def _release(text: str) -> tuple[int, ...]:
 @contextmanager
 def atomic_mcap(path: Path, *, profile: str) -> Iterator[Writer]:
     """A writer whose file gets its name when it is complete; whatever goes wrong before leaves nothing behind."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
-    try:
-        with os.fdopen(handle, "wb") as file:
-            writer = Writer(file, enable_data_crcs=True)
-            writer.start(profile=profile, library="copem_replay")
-            yield writer
-            writer.finish()  # type: ignore[no-untyped-call]
-            file.flush()
-            os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)  # mkstemp makes files for the owner only
-        os.replace(name, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        with suppress(FileNotFoundError):
-            os.unlink(name)
+    with atomic_file(path) as scratch, scratch.open("wb") as file:
+        writer = Writer(file, enable_data_crcs=True)
+        writer.start(profile=profile, library="copem_replay")
+        yield writer
+        writer.finish()  # type: ignore[no-untyped-call]

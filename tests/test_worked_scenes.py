@@ -255,3 +255,16 @@ def test_no_ego_distances_from_a_unit() -> None:
     assert found["time_to_detection_s"] == pytest.approx(2.0)
     assert found["distance_at_detection_m"] == pytest.approx(60.0)
     assert found["gap_at_detection_m"] == pytest.approx(58.0), "a unit is a point"
+
+
+def test_an_offset_moves_a_fixed_unit_along_its_own_heading() -> None:
+    """At (5, 0), looking north; 3 m forward and 4 m to the left is (1, 3). The car at x is hypot(x − 1, 3) away."""
+    mast = {"at": [5, 0], "yaw_deg": 90, "offset_m": [3, 4], "height_m": 5.0, "pem": "all"}
+    plan = experiment(units={"mast": mast}, configurations={"all": {"units": "all"}}, measure={"distance_to": "mast"})
+    log = scenes.oncoming_car()
+    found = candidates(log.scene, log.truth, plan)
+    other = found.tracks.row_object_ix == log.scene.object_number["other"]
+    assert found.look.range_m[other][0] == pytest.approx(np.hypot(99, 3))
+    result = run(plan, [log])
+    distance = row(result, "all")["distance_at_detection_m"]
+    assert distance == pytest.approx(np.hypot(100 - 10 * row(result, "all")["detection_s"] - 1, 3))

@@ -242,6 +242,25 @@ def test_lists_of_a_real_unit_are_read() -> None:
         read_lists(path, "nowhere", scene)
 
 
+def test_lists_that_cannot_be_decoded_and_a_foreign_detail_topic(written: Written, tmp_path: Path) -> None:
+    path = tmp_path / "odd.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="other")
+        lists = writer.register_channel(
+            "u/objects", "protobuf", writer.register_schema("osi3.SensorData", "protobuf", b"")
+        )
+        foreign = writer.register_channel("u/detail", "json", writer.register_schema("their.Detail", "jsonschema", b""))
+        writer.add_message(lists, 7, SensorData().SerializeToString(), 7)
+        writer.add_message(foreign, 7, b"no json", 7)
+        bad = writer.register_channel("bad", "protobuf", writer.register_schema("osi3.SensorData", "protobuf", b"2"))
+        writer.add_message(bad, 8, b"\xff\xff", 8)
+        writer.finish()
+    assert read_lists(path, "u/objects", written.replay.scene).stamp_ns.tolist() == [7]
+    with pytest.raises(RecordingError, match="bad: a message cannot be decoded"):
+        read_lists(path, "bad", written.replay.scene)
+
+
 def test_the_same_bytes_again(written: Written, tmp_path: Path) -> None:
     written.write(tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == written.path.read_bytes()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from copem_replay.atomic import atomic_file
 from copem_replay.colours import configuration_colours
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
@@ -52,7 +51,8 @@ def write_rrd(
             memory = rec.memory_recording()
             rec.send_blueprint(blueprint, make_active=False)
             _fill(Out(rec, replay.scene.t0_ns), replay, experiment, beliefs, table, summary, run, shown)
-        _replace(path, memory.drain_as_bytes())
+        with atomic_file(path) as scratch:
+            scratch.write_bytes(memory.drain_as_bytes())
     finally:
         rr.set_strict_mode(strict)
 
@@ -63,17 +63,6 @@ def latest_known(table: pd.DataFrame, most: int) -> list[str]:
     worst = time_s.groupby(table["object_id"], sort=False).max()
     chosen = set(worst.sort_values(ascending=False, kind="stable").index[:most])
     return [name for name in worst.index if name in chosen]
-
-
-def _replace(path: Path, content: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp") as folder:
-            scratch = Path(folder) / path.name
-            scratch.write_bytes(content)
-            os.replace(scratch, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _fill(
