@@ -269,6 +269,7 @@ def _share(
     t: int, near: Int, count: int, xy: Float, size: Int, zlo: Float, zhi: Float,
     ox: float, oy: float, oz: float, bearing: float, lo: float, hi: float, flat: bool, work: Work,
 ) -> float:  # fmt: skip
+    # The share of target t that the bodies near[:count] leave visible: the open azimuths, column by column.
     local, breaks, begin, end, splits, low, high = work
     cos, sin = np.cos(bearing), np.sin(bearing)
     n_breaks = _insert(breaks, 0, lo)
@@ -288,92 +289,112 @@ def _share(
         a, b = breaks[piece], breaks[piece + 1]
         if b - a < 1e-12:
             continue
-        mid = (a + b) / 2
-        ux, uy = np.cos(mid), np.sin(mid)
+        ux, uy = np.cos((a + b) / 2), np.sin((a + b) / 2)
         hit, face, tx, ty, _fx, _fy = _faces(local[count], size[t], ux, uy)
         if not hit:  # rounding at a grazing corner
             continue
-        cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-        active = 0
-        hidden = False
-        for i in range(count):
-            body = near[i]
-            hit, enter, nx, ny, fx, fy = _faces(local[i], size[body], ux, uy)
-            if not hit or enter >= face:
-                continue
-            if flat:
-                hidden = True
-                break
-            l, h = zlo[body] - oz, zhi[body] - oz  # noqa: E741
-            if l < 0.0:
-                begin[active, 0], begin[active, 1] = l * nx, l * ny
-            else:
-                begin[active, 0], begin[active, 1] = l * fx, l * fy
-            if h > 0.0:
-                end[active, 0], end[active, 1] = h * nx, h * ny
-            else:
-                end[active, 0], end[active, 1] = h * fx, h * fy
-            # Linear in u: what holds at both ends of the piece holds throughout.
-            bx, by, tx0, ty0 = begin[active, 0], begin[active, 1], z0 * tx, z0 * ty
-            cx, cy, tx1, ty1 = end[active, 0], end[active, 1], z1 * tx, z1 * ty
-            below = (bx - tx0) * cos_a + (by - ty0) * sin_a <= 0 and (bx - tx0) * cos_b + (by - ty0) * sin_b <= 0
-            above = (cx - tx1) * cos_a + (cy - ty1) * sin_a >= 0 and (cx - tx1) * cos_b + (cy - ty1) * sin_b >= 0
-            if below and above:
-                hidden = True
-                break
-            low_end = (cx - tx0) * cos_a + (cy - ty0) * sin_a <= 0 and (cx - tx0) * cos_b + (cy - ty0) * sin_b <= 0
-            high_begin = (bx - tx1) * cos_a + (by - ty1) * sin_a >= 0 and (bx - tx1) * cos_b + (by - ty1) * sin_b >= 0
-            if not (low_end or high_begin):
-                active += 1
-        if hidden:
-            continue
+        active = _active(
+            near, count, local, size, zlo, zhi, oz, ux, uy, face, tx, ty, z0, z1, a, b, flat, begin, end
+        )  # fmt: skip
         if active == 0:
             seen += b - a
-            continue
-        n_splits = _insert(splits, 0, a)
-        n_splits = _insert(splits, n_splits, b)
-        for i in range(active):
-            for edge in range(2):
-                gx = begin[i, 0] if edge == 0 else end[i, 0]
-                gy = begin[i, 1] if edge == 0 else end[i, 1]
-                for other in range(-2, 2 * active):
-                    if other < 0:
-                        z = z0 if other == -2 else z1
-                        hx, hy = z * tx, z * ty
-                    elif other // 2 <= i:
-                        continue
-                    elif other % 2 == 0:
-                        hx, hy = begin[other // 2, 0], begin[other // 2, 1]
-                    else:
-                        hx, hy = end[other // 2, 0], end[other // 2, 1]
-                    at = _equal_at(gx - hx, gy - hy, a, b, cos_a, sin_a, cos_b, sin_b)
-                    if at > a and n_splits < _MAX_PIECES:
-                        n_splits = _insert(splits, n_splits, at)
-        for k in range(n_splits - 1):
-            left, width = splits[k], splits[k + 1] - splits[k]
-            if width < 1e-12:
-                continue
-            for g in range(3):
-                theta = left + width * (0.5 + (g - 1) * 0.3872983346207417)  # √0.15: Gauss–Legendre
-                ux, uy = np.cos(theta), np.sin(theta)
-                inverse = tx * ux + ty * uy
-                n_covered = 0
-                for i in range(active):
-                    covered0 = ((begin[i, 0] * ux + begin[i, 1] * uy) / inverse - z0) / (z1 - z0)
-                    covered1 = ((end[i, 0] * ux + end[i, 1] * uy) / inverse - z0) / (z1 - z0)
-                    covered0, covered1 = max(covered0, 0.0), min(covered1, 1.0)
-                    if covered1 <= covered0:
-                        continue
-                    j = n_covered
-                    while j > 0 and low[j - 1] > covered0:
-                        low[j], high[j] = low[j - 1], high[j - 1]
-                        j -= 1
-                    low[j], high[j] = covered0, covered1
-                    n_covered += 1
-                open_, reach = 1.0, 0.0
-                for i in range(n_covered):
-                    if high[i] > reach:
-                        open_ -= high[i] - max(low[i], reach)
-                        reach = high[i]
-                seen += open_ * width * (8.0 if g == 1 else 5.0) / 18.0
+        elif active > 0:
+            n_splits = _split(active, begin, end, tx, ty, z0, z1, a, b, splits)
+            for k in range(n_splits - 1):
+                width = splits[k + 1] - splits[k]
+                if width < 1e-12:
+                    continue
+                for g in range(3):
+                    theta = splits[k] + width * (0.5 + (g - 1) * 0.3872983346207417)  # √0.15: Gauss–Legendre
+                    weight = (8.0 if g == 1 else 5.0) / 18.0
+                    seen += width * weight * _open(active, begin, end, tx, ty, z0, z1, theta, low, high)
     return float(min(max(seen / (hi - lo), 0.0), 1.0))
+
+
+@nb.njit(inline="always")
+def _active(
+    near: Int, count: int, local: Float, size: Int, zlo: Float, zhi: Float, oz: float, ux: float, uy: float,
+    face: float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, flat: bool, begin: Float, end: Float,
+) -> int:  # fmt: skip
+    # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in begin and end.
+    # −1 where one of them covers all of it. Linear in u: what holds at both ends holds throughout.
+    cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    tx0, ty0, tx1, ty1 = z0 * tx, z0 * ty, z1 * tx, z1 * ty
+    active = 0
+    for i in range(count):
+        body = near[i]
+        hit, enter, nx, ny, fx, fy = _faces(local[i], size[body], ux, uy)
+        if not hit or enter >= face:
+            continue
+        if flat:
+            return -1
+        bottom, top = zlo[body] - oz, zhi[body] - oz
+        # It begins to cover at its lower edge: the near one where that is below the eyes, else the far one.
+        bx, by = (bottom * nx, bottom * ny) if bottom < 0.0 else (bottom * fx, bottom * fy)
+        ex, ey = (top * nx, top * ny) if top > 0.0 else (top * fx, top * fy)
+        below = (bx - tx0) * cos_a + (by - ty0) * sin_a <= 0 and (bx - tx0) * cos_b + (by - ty0) * sin_b <= 0
+        above = (ex - tx1) * cos_a + (ey - ty1) * sin_a >= 0 and (ex - tx1) * cos_b + (ey - ty1) * sin_b >= 0
+        if below and above:
+            return -1
+        under = (ex - tx0) * cos_a + (ey - ty0) * sin_a <= 0 and (ex - tx0) * cos_b + (ey - ty0) * sin_b <= 0
+        over = (bx - tx1) * cos_a + (by - ty1) * sin_a >= 0 and (bx - tx1) * cos_b + (by - ty1) * sin_b >= 0
+        if not (under or over):
+            begin[active, 0], begin[active, 1], end[active, 0], end[active, 1] = bx, by, ex, ey
+            active += 1
+    return active
+
+
+@nb.njit(cache=True, nogil=True)
+def _split(
+    active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, splits: Float
+) -> int:
+    # The azimuths from a to b between which no slope crosses another, nor an end of the column; how many.
+    cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    n_splits = _insert(splits, 0, a)
+    n_splits = _insert(splits, n_splits, b)
+    for i in range(active):
+        for edge in range(2):
+            gx = begin[i, 0] if edge == 0 else end[i, 0]
+            gy = begin[i, 1] if edge == 0 else end[i, 1]
+            for other in range(-2, 2 * active):
+                if other < 0:
+                    z = z0 if other == -2 else z1
+                    hx, hy = z * tx, z * ty
+                elif other // 2 <= i:
+                    continue
+                elif other % 2 == 0:
+                    hx, hy = begin[other // 2, 0], begin[other // 2, 1]
+                else:
+                    hx, hy = end[other // 2, 0], end[other // 2, 1]
+                at = _equal_at(gx - hx, gy - hy, a, b, cos_a, sin_a, cos_b, sin_b)
+                if at > a and n_splits < _MAX_PIECES:
+                    n_splits = _insert(splits, n_splits, at)
+    return n_splits
+
+
+@nb.njit(inline="always")
+def _open(
+    active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, theta: float,
+    low: Float, high: Float,
+) -> float:  # fmt: skip
+    # The share of the column at one azimuth that is not covered: 1 less the union of the bodies' intervals.
+    ux, uy = np.cos(theta), np.sin(theta)
+    inverse = tx * ux + ty * uy
+    n_covered = 0
+    for i in range(active):
+        first = max(((begin[i, 0] * ux + begin[i, 1] * uy) / inverse - z0) / (z1 - z0), 0.0)
+        last = min(((end[i, 0] * ux + end[i, 1] * uy) / inverse - z0) / (z1 - z0), 1.0)
+        if last <= first:
+            continue
+        j = n_covered
+        while j > 0 and low[j - 1] > first:
+            low[j], high[j] = low[j - 1], high[j - 1]
+            j -= 1
+        low[j], high[j] = first, last
+        n_covered += 1
+    left, reach = 1.0, 0.0
+    for i in range(n_covered):
+        if high[i] > reach:
+            left -= high[i] - max(low[i], reach)
+            reach = high[i]
+    return left
