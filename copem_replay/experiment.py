@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
 
-from copem_replay.components import Count, Flag, Frozen, NotNegative, Number, Positive, Share
+from copem_replay.braking.driver import DRIVERS, Driver
+from copem_replay.components import Count, Flag, Frozen, NotNegative, Number, Positive, Share, Slot
 from copem_replay.pem.condition import ClassNames, Pem
 
 
@@ -181,6 +182,17 @@ class Confirm(Frozen):
         return self
 
 
+class Conflict(Frozen):
+    """When a perceived state implies a collision: its predicted way meets the ego's corridor within the horizon.
+
+    The corridor is what the ego, at its present speed, will sweep of its own path, and `margin_m` around it; the object is
+    taken to keep its perceived velocity.
+    """
+
+    horizon_s: Positive = 3.0
+    margin_m: NotNegative = 0.5
+
+
 class Measure(Frozen):
     """What is measured, and from when."""
 
@@ -190,6 +202,21 @@ class Measure(Frozen):
     confirm: Confirm = Confirm()
     distance_to: Id = "ego"
     horizon_s: Positive | None = None
+    conflict: Conflict | None = None
+    exact: Flag = False
+
+
+class Braking(Frozen):
+    """What the ego's declared driver does when an object is known (`brakes_for: object`) or seen to be in its way.
+
+    `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (whoever was recorded may
+    have braked already).
+    """
+
+    driver: Annotated[Driver, Slot("driver", DRIVERS)]
+    margin_m: NotNegative = 0.5
+    ego: Literal["recorded", "constant_speed"] = "recorded"
+    brakes_for: Literal["object", "conflict"] = "object"
 
 
 class Read(Frozen):
@@ -221,6 +248,7 @@ class Experiment(Frozen):
     visibility: Literal["surface", "flat"] = "surface"
     configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]
     measure: Measure = Measure()
+    braking: Braking | None = None
     show: Show | None = Show()
 
     def units_of(self, configuration: Configuration) -> tuple[str, ...]:

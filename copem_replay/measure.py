@@ -7,13 +7,18 @@ gap_at_detection_m: the same from box to box. Source: Piazzoni et al. 2022 (dist
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from copem_replay.braking.driver import delays_of
+from copem_replay.braking.encounter import Encounter
+from copem_replay.braking.verdict import Verdicts, judge
+from copem_replay.chance import Address, Dice, object_words
 from copem_replay.detect import Detections
 from copem_replay.experiment import Experiment
 from copem_replay.onset import ENDED_BY, Looks, Reference, reference_at
@@ -24,59 +29,123 @@ from copem_replay.visibility import rectangles
 T = TypeVar("T", bound=np.generic)
 
 
+@dataclass(frozen=True)
+class Events:
+    """What one configuration came to know and when, run by run: (S, M), or (1, M) where all runs agree.
+
+    `units`: names of those whose indices `detections` has. `foreseen_s`: when a collision was implied, NaN: never.
+    """
+
+    units: tuple[str, ...]
+    detections: Detections
+    foreseen_s: Float | None = None
+
+
 def table(
     scene: Scene,
     truth: Tracks,
     experiment: Experiment,
     found: Looks,
+    meeting: Sequence[Encounter],
     runs: Int,
-    detections: Mapping[str, tuple[tuple[str, ...], Detections]],
+    events: Mapping[str, Events],
 ) -> pd.DataFrame:
-    """The rows of `detections.parquet` of one log and block of runs, by configuration, run and object.
-
-    `detections`: for each configuration the names of its units and what was detected, (S, M) or (1, M) where all runs
-    agree.
-    """
-    parts = [
-        _rows(scene, truth, experiment, found, runs, name, units, result)
-        for name, (units, result) in detections.items()
-    ]
+    """The rows of `detections.parquet` of one log and block of runs, by configuration, run and object."""
+    delay_s = _delays(scene, experiment, found, runs)
+    parts = []
+    for name, known in events.items():
+        columns = _columns(scene, truth, experiment, found, runs, name, known)
+        if delay_s is not None:
+            columns |= _braking(experiment, found, meeting, delay_s, known)
+        # Plain objects are quicker to make by way of categories.
+        parts.append(pd.DataFrame(columns).astype({"log": object, "configuration": object}))
     return pd.concat(parts, ignore_index=True)
 
 
-def _rows(
-    scene: Scene, truth: Tracks, experiment: Experiment, found: Looks, runs: Int,
-    configuration: str, units: tuple[str, ...], result: Detections,
-) -> pd.DataFrame:  # fmt: skip
+def _columns(
+    scene: Scene, truth: Tracks, experiment: Experiment, found: Looks, runs: Int, configuration: str, known: Events
+) -> dict[str, Any]:
+    """Columns (S · M,) of one configuration: what was known, when and how far away."""
     S, M = len(runs), len(found.object_ix)
 
     def flat(values: NDArray[T]) -> NDArray[T]:
         return np.broadcast_to(values, (S, M)).ravel()
 
+    result = known.detections
     detection_s = flat(result.detection_s)
     distance_m, gap_m = _distances(scene, truth, experiment, flat(found.object_ix), detection_s)
     onset_s = flat(found.onset_s)
-    names = np.array([*units, None], dtype=object)  # −1: none
-    return pd.DataFrame(
-        {
-            "log": pd.Categorical.from_codes(np.zeros(S * M, dtype=np.int8), [scene.log]),
-            "configuration": pd.Categorical.from_codes(np.zeros(S * M, dtype=np.int8), [configuration]),
-            "run": np.repeat(runs, M),
-            "object_id": np.array(scene.object_ids, dtype=object)[flat(found.object_ix)],
-            "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(found.object_ix)]],
-            "onset_s": onset_s,
-            "onset_at_start": flat(found.onset_at_start),
-            "detected": ~np.isnan(detection_s),
-            "detection_s": detection_s,
-            "captured_s": flat(result.captured_s),
-            "time_to_detection_s": detection_s - onset_s,
-            "distance_at_detection_m": distance_m,
-            "gap_at_detection_m": gap_m,
-            "ended_s": flat(found.ended_s),
-            "ended_by": np.array(ENDED_BY, dtype=object)[flat(found.ended_by)],
-            "first_unit": names[flat(result.first_unit_ix)],
+    names = np.array([*known.units, None], dtype=object)  # −1: none
+    columns: dict[str, Any] = {
+        "log": pd.Categorical.from_codes(np.zeros(S * M, dtype=np.int8), [scene.log]),
+        "configuration": pd.Categorical.from_codes(np.zeros(S * M, dtype=np.int8), [configuration]),
+        "run": np.repeat(runs, M),
+        "object_id": np.array(scene.object_ids, dtype=object)[flat(found.object_ix)],
+        "object_class": np.array(CLASSES, dtype=object)[scene.object_class[flat(found.object_ix)]],
+        "onset_s": onset_s,
+        "onset_at_start": flat(found.onset_at_start),
+        "detected": ~np.isnan(detection_s),
+        "detection_s": detection_s,
+        "captured_s": flat(result.captured_s),
+        "time_to_detection_s": detection_s - onset_s,
+        "distance_at_detection_m": distance_m,
+        "gap_at_detection_m": gap_m,
+        "ended_s": flat(found.ended_s),
+        "ended_by": np.array(ENDED_BY, dtype=object)[flat(found.ended_by)],
+        "first_unit": names[flat(result.first_unit_ix)],
+    }
+    if known.foreseen_s is not None:
+        foreseen_s = flat(known.foreseen_s)
+        columns |= {
+            "conflict_detected": ~np.isnan(foreseen_s),
+            "conflict_detection_s": foreseen_s,
+            "time_to_conflict_detection_s": foreseen_s - onset_s,
+            "distance_at_conflict_detection_m": _distances(
+                scene, truth, experiment, flat(found.object_ix), foreseen_s
+            )[0],
         }
-    ).astype({"log": object, "configuration": object})
+    return columns
+
+
+def _delays(scene: Scene, experiment: Experiment, found: Looks, runs: Int) -> Float | None:
+    """(S, M) seconds the driver takes to react: one per object and run, in every configuration. None without braking."""
+    if experiment.braking is None:
+        return None
+    none = np.zeros(len(found.object_ix), dtype=np.int64)
+    words = object_words([scene.object_ids[k] for k in found.object_ix])
+    uniform = Dice(experiment.seed, scene.log).uniform("reaction", Address(("",), none, words, none), runs)
+    return delays_of(experiment.braking.driver.reaction, uniform.ravel()).reshape(uniform.shape)
+
+
+def _braking(
+    experiment: Experiment, found: Looks, meeting: Sequence[Encounter], delay_s: Float, known: Events
+) -> dict[str, Any]:
+    """Columns (S · M,) of one configuration: the verdicts of the looks in conflict; null for the others."""
+    braking = experiment.braking
+    assert braking is not None
+    shape = delay_s.shape
+    event_s = known.detections.detection_s if braking.brakes_for == "object" else known.foreseen_s
+    assert event_s is not None
+    # What is known before the onset is no hazard yet.
+    brake_s = np.maximum(np.broadcast_to(event_s, shape), found.onset_s) + delay_s
+    in_conflict = np.zeros(shape, dtype=bool)
+    numbers = {name: np.full(shape, np.nan) for name in Verdicts.__dataclass_fields__}
+    for encounter in meeting:
+        m = encounter.look_ix
+        in_conflict[:, m] = True
+        verdicts = judge(encounter, braking.driver, np.where(np.isnan(brake_s[:, m]), np.inf, brake_s[:, m]))
+        for name, values in numbers.items():
+            values[:, m] = getattr(verdicts, name)
+    passed = np.where(in_conflict, numbers["min_distance_m"] > braking.margin_m, None)
+    return {
+        "conflict": in_conflict.ravel(),
+        "brake_s": np.where(in_conflict, brake_s, np.nan).ravel(),
+        "braking_pass": pd.array(passed.ravel(), dtype="boolean"),
+        "min_distance_m": numbers["min_distance_m"].ravel(),
+        "impact_s": numbers["impact_s"].ravel(),
+        "impact_speed_mps": numbers["impact_speed_mps"].ravel(),
+        "required_deceleration_mps2": numbers["required_mps2"].ravel(),
+    }
 
 
 def _distances(

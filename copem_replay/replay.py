@@ -4,27 +4,33 @@ function of it, so that blocks can be computed anywhere, in any order, by any nu
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
+from copem_replay.braking.encounter import EgoCourse, Encounter, encounters
 from copem_replay.candidates import Candidates, candidates
-from copem_replay.detect import Detections, detect
+from copem_replay.detect import detect
 from copem_replay.experiment import Configuration, Experiment
+from copem_replay.foresee import foreseen
 from copem_replay.fusion.ideal import Belief, draw_posterior, fuse
 from copem_replay.fusion.inbox import inbox
-from copem_replay.measure import table
+from copem_replay.measure import Events, table
 from copem_replay.onset import Looks, looks
 from copem_replay.perceive import perceive
 from copem_replay.read import Recording
 from copem_replay.resample import at_instants
-from copem_replay.tracks import TRUTH, Int, Scene, Tracks
+from copem_replay.tracks import TRUTH, Float, Int, Scene, Tracks
 from copem_replay.transmit import transmit
 
 ROWS_TIMES_RUNS = 50_000_000
 """How many row × run cells a block may hold (chosen: a byte each while only detections are drawn)."""
+
+STATE_BYTES = 100
+"""Bytes of a row × run cell where states are sampled and fused, too (chosen: a dozen numbers)."""
 
 WORTH_A_BLOCK = 1_000_000
 """Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
@@ -39,6 +45,7 @@ class Replay:
     found: Candidates
     measured: Candidates  # the rows of objects that are looked at
     looks: Looks
+    encounters: tuple[Encounter, ...]  # those in conflict
 
 
 def prepare(recording: Recording, experiment: Experiment) -> Replay:
@@ -47,7 +54,8 @@ def prepare(recording: Recording, experiment: Experiment) -> Replay:
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     found = candidates(scene, truth, experiment)
     on = looks(scene, truth, found.static, experiment)
-    return Replay(scene, truth, found, found.of_objects(on.object_ix), on)
+    meeting = encounters(scene, truth, on, experiment)
+    return Replay(scene, truth, found, found.of_objects(on.object_ix), on, meeting)
 
 
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
@@ -56,14 +64,15 @@ def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
     even = -(-experiment.runs // jobs)
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
     small = max(-(-even // 8), WORTH_A_BLOCK // rows)
-    size = max(1, min(ROWS_TIMES_RUNS // rows, even, small))
+    at_once = ROWS_TIMES_RUNS // (rows * (STATE_BYTES if experiment.measure.conflict is not None else 1))
+    size = max(1, min(at_once, even, small))
     return [np.arange(k, min(k + size, experiment.runs)) for k in range(0, experiment.runs, size)]
 
 
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
     """The rows of `detections.parquet` of one block of runs (S,)."""
     seen = perceive(replay.scene, replay.measured, experiment, runs, states="true")
-    results: dict[str, tuple[tuple[str, ...], Detections]] = {}
+    results: dict[str, Events] = {}
     for name, configuration in experiment.configurations.items():
         heard = listen(seen, replay.truth, experiment, configuration)
         result = detect(
@@ -73,8 +82,25 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
         )
-        results[name] = (heard.units, result)
-    return table(replay.scene, replay.truth, experiment, replay.looks, runs, results)
+        results[name] = Events(heard.units, result)
+    if experiment.measure.conflict is not None:
+        for name, belief in _beliefs(replay, replay.measured, experiment, runs):
+            results[name] = replace(results[name], foreseen_s=_foreseen(replay, belief, experiment))
+    return table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, results)
+
+
+def _foreseen(replay: Replay, belief: Belief, experiment: Experiment) -> Float:
+    """(S, M) when each look is first seen to lead to a collision."""
+    measure = experiment.measure
+    assert measure.conflict is not None
+    return foreseen(
+        belief,
+        EgoCourse(replay.scene, replay.truth, experiment.max_gap_s),
+        replay.looks,
+        measure.conflict,
+        confirm=measure.confirm,
+        count_earlier=measure.count_earlier,
+    )
 
 
 def listen(seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration) -> Tracks:
@@ -90,21 +116,25 @@ def listen(seen: Tracks, truth: Tracks, experiment: Experiment, configuration: C
 
 def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
     """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
-    runs = np.array([run])
+    return dict(_beliefs(replay, replay.found, experiment, np.array([run])))
+
+
+def _beliefs(
+    replay: Replay, found: Candidates, experiment: Experiment, runs: Int
+) -> Iterator[tuple[str, Belief]]:
+    """Fused lists in the runs (S,), made of the rows of `found`."""
     ego = replay.scene.ego_ix
     seen: dict[bool, Tracks] = {}  # by whether the states are the expected ones; each is made when first needed
-    result = {}
     for name, configuration in experiment.configurations.items():
         posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
         if posterior not in seen:
             states: Literal["expected", "sampled"] = "expected" if posterior else "sampled"
-            seen[posterior] = perceive(replay.scene, replay.found, experiment, runs, states=states)
+            seen[posterior] = perceive(replay.scene, found, experiment, runs, states=states)
         heard = listen(seen[posterior], replay.truth, experiment, configuration)
         belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
         if configuration.units != TRUTH:
-            belief = replace(belief, look=replay.found.look)
-        result[name] = draw_posterior(belief, replay.scene, experiment.seed, runs) if posterior else belief
-    return result
+            belief = replace(belief, look=found.look)
+        yield name, draw_posterior(belief, replay.scene, experiment.seed, runs) if posterior else belief
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:

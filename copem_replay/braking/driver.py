@@ -1,0 +1,140 @@
+"""Driver models: what the ego does once an object is known. They say delays and ways, and never draw.
+
+A driver reacts after a delay and then brakes along its path; it does not steer. It is declared, not observed: a verdict
+is that of the declared driver.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from copem_replay.components import Component, NotNegative, Positive, Slot, asked
+from copem_replay.errors import InputError
+from copem_replay.tracks import Float
+
+
+class Reaction(Component, ABC):
+    """Base of reaction models: seconds from the instant a list is available until the ego begins to brake."""
+
+    @abstractmethod
+    def delays(self, uniform: Float) -> Float:
+        """(K,) seconds for uniform numbers (K,) in (0, 1): the inverse of their distribution, never decreasing."""
+
+
+class ConstantReaction(Reaction):
+    """The same delay every time."""
+
+    kind: Literal["constant"] = "constant"
+    delay_s: NotNegative = 0.0
+
+    def delays(self, uniform: Float) -> Float:
+        """(K,) all the same."""
+        return np.full(len(uniform), self.delay_s)
+
+
+class GammaReaction(Reaction):
+    """Gamma distributed delays, by shape and mean."""
+
+    kind: Literal["gamma"] = "gamma"
+    shape: Annotated[float, Field(strict=True, ge=0.01, le=1e6)]
+    mean_s: Positive
+
+    def delays(self, uniform: Float) -> Float:
+        """(K,) quantiles of the gamma distribution."""
+        from scipy.special import gammaincinv
+
+        result: Float = gammaincinv(self.shape, uniform) * (self.mean_s / self.shape)
+        return result
+
+
+class LognormalReaction(Reaction):
+    """Log-normal delays, by median and the standard deviation of their logarithm."""
+
+    kind: Literal["lognormal"] = "lognormal"
+    median_s: Positive
+    sigma: Annotated[float, Field(strict=True, ge=0, le=10)]
+
+    def delays(self, uniform: Float) -> Float:
+        """(K,) quantiles of the log-normal distribution."""
+        from scipy.special import ndtri
+
+        result: Float = self.median_s * np.exp(self.sigma * ndtri(uniform))
+        return result
+
+
+REACTIONS = {
+    "constant": "copem_replay.braking.driver:ConstantReaction",
+    "gamma": "copem_replay.braking.driver:GammaReaction",
+    "lognormal": "copem_replay.braking.driver:LognormalReaction",
+}
+
+
+class Driver(Component, ABC):
+    """Base of driver models: how long it takes to react, and how far the ego still drives once it brakes."""
+
+    reaction: Annotated[Reaction, Slot("reaction", REACTIONS)] = ConstantReaction()
+
+    @abstractmethod
+    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        """(R, T) metres driven `elapsed_s (R, T)` ≥ 0 after braking began at `speed_mps (R, 1)`; never decreasing."""
+
+
+class ConstantDeceleration(Driver):
+    """Brakes with `a_max_mps2` to a stop; with `build_up_s` the deceleration grows linearly to it over that time.
+
+    With build-up the jerk is a_max / build_up (as in the careful and competent driver of UN R157, by way of esmini's
+    reading of it: algorithm and values in docs/measures.md).
+    """
+
+    kind: Literal["constant_deceleration"] = "constant_deceleration"
+    a_max_mps2: Annotated[float, Field(strict=True, ge=0.01, le=100)]
+    build_up_s: Annotated[float, Field(strict=True, ge=0, le=100)] = 0.0
+
+    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        """(R, T) by the kinematics of constant jerk, then constant deceleration, then standstill."""
+        a, grows_s = self.a_max_mps2, self.build_up_s
+        first_s = np.minimum(elapsed_s, grows_s)
+        way = 0.0 * elapsed_s
+        speed = speed_mps
+        if grows_s:
+            jerk = a / grows_s
+            first_s = np.minimum(first_s, np.sqrt(2 * speed_mps / jerk))  # slow enough, it stops meanwhile
+            way = first_s * (speed_mps - jerk * first_s**2 / 6)
+            speed = np.maximum(speed_mps - jerk * grows_s**2 / 2, 0.0)
+        then_s = np.minimum(np.maximum(elapsed_s - grows_s, 0.0), speed / a)
+        result: Float = way + then_s * (speed - a * then_s / 2)
+        return result
+
+
+DRIVERS = {"constant_deceleration": "copem_replay.braking.driver:ConstantDeceleration"}
+
+
+def delays_of(reaction: Reaction, uniform: Float) -> Float:
+    """(K,) what a reaction model says of uniform numbers (K,), checked. Raises InputError when it is no delay."""
+    where = "braking.driver.reaction"
+    found = asked(reaction, where, lambda: np.asarray(reaction.delays(uniform), dtype=float))
+    if found.shape != uniform.shape:
+        raise InputError(
+            f"{where}: {reaction.kind}: delays(uniform): expected shape {uniform.shape}, found {found.shape}"
+        )
+    wrong = ~((found >= 0) & np.isfinite(found))
+    if wrong.any():
+        raise InputError(f"{where}: {reaction.kind}: delays(uniform): expected seconds ≥ 0, found {found[wrong][0]}")
+    return found
+
+
+def way_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
+    """(R, T) what a driver model says of `elapsed_s (R, T)` and `speed_mps (R, 1)`, checked. Raises InputError."""
+    where = "braking.driver"
+    found = asked(driver, where, lambda: np.asarray(driver.way_m(elapsed_s, speed_mps), dtype=float))
+    what = f"{where}: {driver.kind}: way_m(elapsed_s, speed_mps)"
+    if found.shape != elapsed_s.shape:
+        raise InputError(f"{what}: expected shape {elapsed_s.shape}, found {found.shape}")
+    wrong = ~((found >= 0) & np.isfinite(found))
+    if wrong.any():
+        raise InputError(f"{what}: expected metres ≥ 0, found {found[wrong][0]}")
+    return found

@@ -1,0 +1,165 @@
+"""Encounters: what would happen between the ego and a measured object if the ego did not brake.
+
+Prepared once per log; nothing here depends on the run or on a configuration. An encounter is *in conflict* when the
+ego, not braking, comes within the margin of the object's true motion after the onset. Times are judged at instants
+`NODE_S` apart and at every frame; between them both move on straight lines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.braking.boxes import nearest, reach
+from copem_replay.experiment import Experiment
+from copem_replay.onset import Looks
+from copem_replay.resample import states_at
+from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
+
+NODE_S = 0.01
+"""Between instants of judgement (chosen: at 10 m/s² a straight line over it is off by 0.13 mm)."""
+
+_SAME_PLACE_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Course:
+    """The ego that does not brake. T instants of one encounter.
+
+    `along_m (T,)` its way from the first vertex of the path, NaN where it is not in the log; `bound_m (T,)` the same with
+    gaps closed, and past its last frame inf: farther than that it never is; `speed_mps (T,)`.
+    """
+
+    along_m: Float
+    bound_m: Float
+    speed_mps: Float
+
+
+@dataclass(frozen=True)
+class Encounter:
+    """One measured object and the ego, from the onset until the object leaves. V vertices of the ego's path."""
+
+    look_ix: int
+    time_s: Float  # (T,)
+    course: Course
+    path: Float  # (V, 4): arc length, x, y, yaw
+    size_m: Float  # (2,) of the ego
+    other: Float  # (3, T): x, y, yaw of the object, NaN where it is not in the log
+    other_size_m: Float  # (2,)
+    reach_m: Float  # (T,): how far the ego can go before it is within the margin, inf: no limit
+
+
+def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: Experiment) -> tuple[Encounter, ...]:
+    """The encounters in conflict, in the order of the looks. None without `braking`."""
+    braking = experiment.braking
+    if braking is None or scene.ego_ix < 0:
+        return ()
+    ego = EgoCourse(scene, truth, experiment.max_gap_s)
+    result = []
+    for k, object_ix in enumerate(found.object_ix):
+        rows = np.flatnonzero(truth.row_object_ix == object_ix)
+        onset_s = float(found.onset_s[k])
+        constant_from_s = onset_s if braking.ego == "constant_speed" else None
+        if _may_meet(ego, truth, rows, onset_s, constant_from_s, braking.margin_m):
+            encounter = _encounter(ego, truth, rows, k, onset_s, constant_from_s, braking.margin_m)
+            result += [encounter] if encounter is not None else []
+    return tuple(result)
+
+
+class EgoCourse:
+    """The ego's path through the log, and how it drives along it.
+
+    `path (V, 4)`: arc length, x, y, yaw; `size_m (2,)`.
+    """
+
+    def __init__(self, scene: Scene, truth: Tracks, max_gap_s: float) -> None:
+        self._truth, self._scene, self._max_gap_s = truth, scene, max_gap_s
+        rows = np.flatnonzero(truth.row_object_ix == scene.ego_ix)
+        x, y = truth.x_m[0, rows], truth.y_m[0, rows]
+        step = np.hypot(np.diff(x), np.diff(y))
+        self.frame_s = truth.row_captured_s[rows]
+        self.frame_m = np.concatenate([[0.0], np.cumsum(step)])
+        self.frame_mps = np.hypot(truth.vx_mps[0, rows], truth.vy_mps[0, rows])
+        moved = np.concatenate([[True], step > _SAME_PLACE_M])
+        yaw = np.unwrap(truth.yaw_rad[0, rows])
+        self.path = np.stack([self.frame_m, x, y, yaw], axis=1)[moved]
+        self.size_m = np.array([truth.length_m[0, rows[0]], truth.width_m[0, rows[0]]])
+
+    def course(self, time_s: Float, constant_from_s: float | None = None) -> Course:
+        """How it drives at instants (T,): as recorded, or with constant speed from an instant on."""
+        if constant_from_s is not None:
+            start_m, speed = (np.interp(constant_from_s, self.frame_s, v) for v in (self.frame_m, self.frame_mps))
+            along = start_m + speed * (time_s - constant_from_s)
+            return Course(along, along, np.full(len(time_s), speed))
+        bound = np.interp(time_s, self.frame_s, self.frame_m, right=np.inf)
+        _, present = self.states(self._scene.ego_ix, time_s)
+        return Course(np.where(present, bound, np.nan), bound, np.interp(time_s, self.frame_s, self.frame_mps))
+
+    def states(self, object_ix: int, time_s: Float) -> tuple[dict[str, Float], Bool]:
+        """States of any object at instants (T,), and whether it is in the log then."""
+        which = np.full(len(time_s), object_ix)
+        return states_at(self._truth, which, time_s, t0_ns=self._scene.t0_ns, max_gap_s=self._max_gap_s)
+
+
+def _may_meet(
+    ego: EgoCourse, truth: Tracks, rows: Int, onset_s: float, constant_from_s: float | None, margin_m: float
+) -> bool:
+    """Whether an object comes anywhere near the ego's course: what surely stays away needs no closer look.
+
+    `rows`: those of the object.
+    """
+    # The frame before the onset stands for the onset itself, which may lie between two.
+    first = max(int(np.searchsorted(truth.row_captured_s[rows], onset_s, side="right")) - 1, 0)
+    bound_m = ego.course(truth.row_captured_s[rows[first:]], constant_from_s).bound_m
+    rows, bound_m = rows[first:][np.isfinite(bound_m)], bound_m[np.isfinite(bound_m)]
+    if not len(rows):
+        return False
+    x, y = _ahead(ego.path, bound_m)
+    dx, dy = truth.x_m[0, rows] - x, truth.y_m[0, rows] - y
+    radii = (np.hypot(*ego.size_m) + np.hypot(truth.length_m[0, rows[0]], truth.width_m[0, rows[0]])) / 2
+    step = np.hypot(np.diff(dx), np.diff(dy)).max(initial=0.0)
+    return bool((np.hypot(dx, dy) - radii - step).min() <= margin_m)
+
+
+def _ahead(path: Float, along_m: Float) -> tuple[Float, Float]:
+    """Places (K,) on a path, straight on beyond its ends."""
+    if len(path) == 1:
+        return np.full(len(along_m), path[0, 1]), np.full(len(along_m), path[0, 2])
+    k = np.clip(np.searchsorted(path[:, 0], along_m) - 1, 0, len(path) - 2)
+    f = (along_m - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
+    return path[k, 1] + f * (path[k + 1, 1] - path[k, 1]), path[k, 2] + f * (path[k + 1, 2] - path[k, 2])
+
+
+def _encounter(
+    ego: EgoCourse, truth: Tracks, rows: Int, look_ix: int, onset_s: float, constant_from_s: float | None,
+    margin_m: float,
+) -> Encounter | None:  # fmt: skip
+    """The encounter of one look, None where the ego, not braking, stays clear."""
+    own_s = truth.row_captured_s[rows]
+    last_s = max(float(own_s[-1]), onset_s)
+    regular = onset_s + NODE_S * np.arange(int((last_s - onset_s) / NODE_S) + 1)
+    frames = own_s[(own_s > onset_s) & (own_s <= last_s)]
+    time_s = np.unique(np.round(np.concatenate([regular, frames]), 9))  # to a nanosecond: equal instants are one
+    at, _ = ego.states(int(truth.row_object_ix[rows[0]]), time_s)
+    course = ego.course(time_s, constant_from_s)
+    other = np.stack([at["x_m"], at["y_m"], _unwrapped(at["yaw_rad"])])
+    other_size = np.array([truth.length_m[0, rows[0]], truth.width_m[0, rows[0]]])
+    near, touch = np.empty(1), np.empty(1)
+    nearest(course.along_m[None], ego.path, ego.size_m, other, other_size, near, touch)
+    if not near[0] <= margin_m:
+        return None
+    # Past its last frame the ego that brakes is no farther than at the speed it had there.
+    past_m = ego.frame_m[-1] + course.speed_mps * (time_s - ego.frame_s[-1])
+    to_m = np.where(np.isinf(course.bound_m), past_m, course.bound_m)
+    limit_m = np.empty(len(time_s))
+    reach(ego.path, ego.size_m, other, other_size, margin_m, float(course.bound_m[0]), to_m, limit_m)
+    return Encounter(look_ix, time_s, course, ego.path, ego.size_m, other, other_size, limit_m)
+
+
+def _unwrapped(yaw_rad: Float) -> Float:
+    """Angles without jumps, NaN left where it is."""
+    known = ~np.isnan(yaw_rad)
+    result = yaw_rad.copy()
+    result[known] = np.unwrap(yaw_rad[known])
+    return result

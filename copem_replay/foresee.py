@@ -1,0 +1,161 @@
+"""Foresee: when does what the receiver believes imply a collision? (The paper's detection of the potential collision.)
+
+A fused list implies one when the object, keeping its perceived velocity from its perceived place, will within the horizon
+be in the ego's corridor: what the ego, at its present speed, will sweep of its own path, and a margin around it. Ways are
+compared, not times: nobody is expected to be exactly in time.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from copem_replay.braking.boxes import pose_on
+from copem_replay.braking.encounter import EgoCourse
+from copem_replay.experiment import Confirm, Conflict
+from copem_replay.fusion.ideal import Belief
+from copem_replay.onset import Looks
+from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+_PIECE_M = 2.0
+"""Length of the straight pieces a corridor is made of, at most (chosen)."""
+
+
+def foreseen(
+    belief: Belief, ego: EgoCourse, found: Looks, wanted: Conflict, *, confirm: Confirm, count_earlier: bool
+) -> Float:
+    """(S, M) when the receiver first has a list (`hits` of its last `of` lists) that implies a collision; NaN: never.
+
+    As with detections, a list counts when something at or after the onset contributed to what it says of the object.
+    """
+    fused = belief.fused
+    issue_s = fused.arrives_s[0]
+    pieces, bounds = corridors(ego, issue_s, wanted)
+    implied = np.zeros(fused.valid.shape, dtype=np.bool_)
+    columns = (fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
+    _implied(fused.valid, *columns, fused.frame_ix, pieces, bounds, wanted.horizon_s, implied)
+    newest_s = np.full(fused.valid.shape, -np.inf)
+    _newest(belief.heard.valid, belief.heard.row_captured_s, belief.entries, belief.start, newest_s)
+    result = np.full((len(fused.valid), len(found.object_ix)), np.nan)
+    track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
+    for m, object_ix in enumerate(found.object_ix):
+        if int(object_ix) not in track_of:
+            continue
+        track = track_of[int(object_ix)]
+        rows = slice(int(fused.start[track]), int(fused.start[track + 1]))
+        counts = implied[:, rows].copy()
+        if not count_earlier:
+            counts &= newest_s[:, rows] >= found.onset_s[m] - _TOLERANCE_S
+        counts &= issue_s[fused.frame_ix[rows]] <= found.ended_s[m] + _TOLERANCE_S
+        _first_confirmed(counts, fused.frame_ix[rows], issue_s, confirm.hits, confirm.of, result[:, m])
+    return result
+
+
+def corridors(ego: EgoCourse, now_s: Float, wanted: Conflict) -> tuple[Float, Int]:
+    """Rectangles (C, 5) — x, y, yaw, length, width — that cover the ego's corridor at instants (K,), grouped (K + 1,).
+
+    None where the ego is not in the log.
+    """
+    course = ego.course(now_s)
+    ahead_m = np.where(np.isnan(course.along_m), np.nan, course.speed_mps * wanted.horizon_s)
+    count = np.where(np.isnan(ahead_m), 0, np.maximum(np.ceil(np.nan_to_num(ahead_m) / _PIECE_M), 1)).astype(np.int64)
+    bounds = np.concatenate([[0], np.cumsum(count)])
+    pieces = np.empty((bounds[-1], 5))
+    size = ego.size_m + 2 * wanted.margin_m
+    _cover(ego.path, course.along_m, np.nan_to_num(ahead_m), bounds, size, pieces)
+    return pieces, bounds
+
+
+@nb.njit(cache=True, nogil=True)
+def _cover(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pieces: Float) -> None:
+    for k in range(len(along)):
+        n = bounds[k + 1] - bounds[k]
+        for j in range(n):
+            x0, y0, yaw0 = pose_on(path, along[k] + ahead[k] * j / n)
+            x1, y1, _ = pose_on(path, along[k] + ahead[k] * (j + 1) / n)
+            way = np.hypot(x1 - x0, y1 - y0)
+            yaw = np.arctan2(y1 - y0, x1 - x0) if way > 1e-3 else yaw0
+            piece = pieces[bounds[k] + j]
+            piece[0], piece[1], piece[2], piece[3], piece[4] = (
+                (x0 + x1) / 2, (y0 + y1) / 2, yaw, way + size[0], size[1]
+            )  # fmt: skip
+
+
+@nb.njit(cache=True, nogil=True)
+def _implied(
+    valid: Bool, x: Float, y: Float, yaw: Float, vx: Float, vy: Float, length: Float, width: Float, frame_ix: Int,
+    pieces: Float, bounds: Int, horizon_s: float, out: Bool,
+) -> None:  # fmt: skip
+    for s in range(valid.shape[0]):
+        for p in range(valid.shape[1]):
+            if not valid[s, p]:
+                continue
+            for c in range(bounds[frame_ix[p]], bounds[frame_ix[p] + 1]):
+                if _will_be_in(
+                    x[s, p], y[s, p], yaw[s, p], vx[s, p], vy[s, p], length[s, p], width[s, p], pieces[c], horizon_s
+                ):
+                    out[s, p] = True
+                    break
+
+
+@nb.njit(cache=True)
+def _will_be_in(
+    x: float, y: float, yaw: float, vx: float, vy: float, length: float, width: float, piece: Float, horizon_s: float
+) -> bool:
+    """Whether a box that moves on straight without turning meets a standing one within the horizon.
+
+    At any instant two rectangles overlap unless an axis of either separates them, and each axis stops and starts to do so
+    at one instant each.
+    """
+    dx, dy = x - piece[0], y - piece[1]
+    first, last = 0.0, horizon_s
+    turn = yaw - piece[2]
+    c, s = abs(np.cos(turn)), abs(np.sin(turn))
+    for axis in range(4):
+        angle = (yaw if axis >= 2 else piece[2]) + (np.pi / 2 if axis & 1 else 0.0)
+        ax, ay = np.cos(angle), np.sin(angle)
+        if axis == 0:
+            reach = piece[3] + c * length + s * width
+        elif axis == 1:
+            reach = piece[4] + s * length + c * width
+        elif axis == 2:
+            reach = length + c * piece[3] + s * piece[4]
+        else:
+            reach = width + s * piece[3] + c * piece[4]
+        reach /= 2
+        apart, speed = ax * dx + ay * dy, ax * vx + ay * vy
+        if abs(speed) < 1e-12:
+            if abs(apart) > reach:
+                return False
+            continue
+        t0, t1 = (-reach - apart) / speed, (reach - apart) / speed
+        first, last = max(first, min(t0, t1)), min(last, max(t0, t1))
+        if first > last:
+            return False
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def _newest(valid: Bool, captured_s: Float, entries: Int, start: Int, out: Float) -> None:
+    for s in range(out.shape[0]):
+        for p in range(out.shape[1]):
+            for c in range(start[p], start[p + 1]):
+                if valid[s, entries[c]]:
+                    out[s, p] = max(out[s, p], captured_s[entries[c]])
+
+
+@nb.njit(cache=True, nogil=True)
+def _first_confirmed(counts: Bool, frame_ix: Int, issue_s: Float, hits: int, of: int, out: Float) -> None:
+    for s in range(counts.shape[0]):
+        for p in range(counts.shape[1]):
+            if not counts[s, p]:
+                continue
+            held = 0
+            for q in range(p, -1, -1):
+                if frame_ix[q] <= frame_ix[p] - of:
+                    break
+                held += counts[s, q]
+            if held >= hits:
+                out[s] = issue_s[frame_ix[p]]
+                break
