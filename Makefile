@@ -12,6 +12,8 @@ BIN := .venv/bin
 
 demo: .venv/.installed
 	$(BIN)/copem-replay run logs/tc016d.yaml --out out/tc016d --overwrite
+	@echo
+	@$(BIN)/python tools/paper.py out/tc016d
 
 test: .venv/.installed
 	$(BIN)/python -m pytest -q -n 2

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from copem_replay.errors import RecordingError
-from copem_replay.experiment import Experiment
+from copem_replay.experiment import LONGEST_CHAIN, Experiment
 from copem_replay.experiment_file import Source, is_there, log_paths, parse
 from copem_replay.plain_yaml import Key
 from copem_replay.read import Recording, moving_ids, read
@@ -67,10 +67,90 @@ def references(source: Source) -> Iterator[str]:
         onset = measure.get("onset")
         if isinstance(onset, dict) and onset.get("kind") == "line_of_sight_any" and not units:
             yield source.at(("measure", "onset"), "line_of_sight_any: there is no unit to see anything")
+    yield from _braking(source, data)
+    yield from _carried(source, data)
+    yield from _sweep(source, data, units)
     show, runs = data.get("show"), data.get("runs", 1)
     run = show.get("run") if isinstance(show, dict) else None
     if isinstance(run, int) and isinstance(runs, int) and 1 <= runs <= run:
         yield source.at(("show", "run"), f"expected a run below {runs}, found {run}")
+
+
+def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
+    """What braking and exact times need, and what they do not go with."""
+    braking, measure = data.get("braking"), data.get("measure")
+    measure = measure if isinstance(measure, dict) else {}
+    confirm = measure.get("confirm")
+    if measure.get("exact") is True and isinstance(confirm, dict):
+        of = confirm.get("of", 1)
+        if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
+            message = f"exact: expected `of` at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
+            yield source.at(("measure", "confirm", "of"), message)
+    if data.get("ego") == NO_EGO:
+        for key in (("braking",), ("measure", "conflict")):
+            if (braking if key[0] == "braking" else measure.get("conflict")) is not None:
+                yield source.at(key, f"{key[-1]}: there is no ego in this study (`ego: none`) to brake or collide")
+    if not isinstance(braking, dict) or braking.get("brakes_for") != "conflict":
+        return
+    if measure.get("conflict") is None:
+        yield source.at(
+            ("braking", "brakes_for"),
+            "brakes_for: conflict needs `measure.conflict`, such as `conflict: {horizon_s: 3}`",
+        )
+    if measure.get("exact") is True:
+        yield source.at(
+            ("measure", "exact"),
+            "exact: perceived conflicts depend on sampled errors and have no closed form; use `brakes_for: object`",
+        )
+
+
+def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
+    """What units that only some runs have do not go with."""
+    measure = data.get("measure")
+    measure = measure if isinstance(measure, dict) else {}
+    of = measure["confirm"].get("of", 1) if isinstance(measure.get("confirm"), dict) else 1
+    for name, unit in _items(data.get("units")):
+        if not isinstance(unit.get("on"), dict):
+            continue
+        if measure.get("distance_to") == name:
+            yield source.at(
+                ("measure", "distance_to"), f"unit {name!r} is carried by several objects; name a single one"
+            )
+        if isinstance(of, int) and of > 1 and unit.get("rate_hz") is not None:
+            yield source.at(
+                ("units", name, "rate_hz"),
+                "a unit that only some runs have confirms over several captures only with the frames of the truth; "
+                "leave rate_hz out, or confirm with one of one",
+            )
+        if isinstance(of, int) and of > 1 and measure.get("exact") is True:
+            yield source.at(
+                ("measure", "exact"),
+                f"exact: unit {name!r} is only in some runs, and confirmation over several captures then has no "
+                "closed form; confirm with one of one",
+            )
+
+
+def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+    """Names and numbers of a sweep that there are not."""
+    sweep = data.get("sweep")
+    if not isinstance(sweep, dict):
+        return
+    named, configurations = sweep.get("configurations"), _names(data.get("configurations"))
+    for k, name in enumerate(named if isinstance(named, list) else []):
+        if _is_name(name) and str(name) not in configurations:
+            yield source.at(("sweep", "configurations", k), _unknown("configuration", name, configurations))
+    carried = [name for name, unit in _items(data.get("units")) if isinstance(unit.get("on"), dict)]
+    if sweep.get("share") and not carried:
+        yield source.at(("sweep", "share"), "share: no unit is `on: {classes, share}`")
+    if sweep.get("rate_hz") and not units:
+        yield source.at(("sweep", "rate_hz"), "rate_hz: the experiment has no units")
+    others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
+    counts = sweep.get("units")
+    for k, count in enumerate(counts if isinstance(counts, list) else []):
+        if isinstance(count, int) and count > others:
+            yield source.at(
+                ("sweep", "units", k), f"expected at most {others}, the units beside the ego's; found {count}"
+            )
 
 
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
@@ -193,7 +273,7 @@ def against_log(
         if unit.on == "ego":
             if not studied:
                 yield ("units", name, "on"), "no ego in this study to carry the unit"
-        elif unit.on is not None and unit.on not in scene.object_number:
+        elif isinstance(unit.on, str) and unit.on not in scene.object_number:
             yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
     if experiment.measure.onset.kind != "line_of_sight" or known:
         return

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from copem_replay.braking.driver import DRIVERS, Driver
 from copem_replay.components import Count, Flag, Frozen, NotNegative, Number, Positive, Share, Slot
@@ -47,23 +47,46 @@ Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
 """Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 
 
-class Unit(Frozen):
-    """A perception unit: carried `on` the ego or another object, or standing `at` a place."""
+Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
+"""Lists per second."""
 
-    on: Id | None = None
+
+class Carriers(Frozen):
+    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability `share`."""
+
+    classes: ClassNames
+    share: Share
+
+
+def _what_carries(value: object) -> str:
+    return "carriers" if isinstance(value, dict | Carriers) else "id"
+
+
+On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], Discriminator(_what_carries)]
+
+
+class Unit(Frozen):
+    """A perception unit: carried `on` the ego, another object or a share of some classes, or standing `at` a place.
+
+    `height_m` above the ground; left out, a carried unit is on the roof.
+    """
+
+    on: On | None = None
     at: Point | None = None
     offset_m: Point = (0.0, 0.0)
     yaw_deg: Number = 0.0
-    height_m: NotNegative
+    height_m: NotNegative | None = None
     ground_z_m: Number | None = None
     pem: Id
-    rate_hz: Annotated[float, Field(strict=True, ge=0.001, le=1000)] | None = None
+    rate_hz: Rate | None = None
     phase_s: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _place(self) -> Self:
         if (self.on is None) == (self.at is None):
-            raise ValueError("expected one of `on: ego`, `on: <object id>` and `at: [x, y]`")
+            raise ValueError("expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`")
+        if self.height_m is None and self.at is not None:
+            raise ValueError("height_m: needed for a unit `at` a place; only a carried one is on a roof by default")
         if self.ground_z_m is not None and self.at is None:
             raise ValueError("ground_z_m: only for a unit `at` a place; a carrier brings its own ground")
         if self.phase_s and self.rate_hz is None:
@@ -166,6 +189,9 @@ class At(Frozen):
 Onset = Annotated[StartsMoving | Appears | InRange | LineOfSight | At, Field(discriminator="kind")]
 
 
+LONGEST_CHAIN = 12
+"""More capture instants than this have no exact times (chosen: the chain has 2¹¹ states)."""
+
 Captures = Annotated[int, Field(strict=True, ge=1, le=1000)]
 
 
@@ -185,8 +211,8 @@ class Confirm(Frozen):
 class Conflict(Frozen):
     """When a perceived state implies a collision: its predicted way meets the ego's corridor within the horizon.
 
-    The corridor is what the ego, at its present speed, will sweep of its own path, and `margin_m` around it; the object is
-    taken to keep its perceived velocity.
+    The corridor is what the ego, at its present speed, will sweep of its own path, and `margin_m` around it; the object
+    is taken to keep its perceived velocity.
     """
 
     horizon_s: Positive = 3.0
@@ -219,6 +245,29 @@ class Braking(Frozen):
     brakes_for: Literal["object", "conflict"] = "object"
 
 
+Units = Annotated[int, Field(strict=True, ge=0, le=10**6)]
+
+
+class Sweep(Frozen):
+    """Values of one quantity at a time at which the configurations (by default all that it changes) are run, too.
+
+    `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
+    `units`: how many of a configuration's units beside the ego's, the first ones. `share`: of those who carry a unit.
+    """
+
+    configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+    latency_s: tuple[Latency, ...] = ()
+    rate_hz: tuple[Rate, ...] = ()
+    units: tuple[Units, ...] = ()
+    share: tuple[Share, ...] = ()
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not (self.latency_s or self.rate_hz or self.units or self.share):
+            raise ValueError("expected values of latency_s, rate_hz, units or share, such as `latency_s: [0, 0.5, 1]`")
+        return self
+
+
 class Read(Frozen):
     """How the truth is found in a recording that holds several object lists."""
 
@@ -249,6 +298,7 @@ class Experiment(Frozen):
     configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]
     measure: Measure = Measure()
     braking: Braking | None = None
+    sweep: Sweep | None = None
     show: Show | None = Show()
 
     def units_of(self, configuration: Configuration) -> tuple[str, ...]:

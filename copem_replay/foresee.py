@@ -1,8 +1,8 @@
 """Foresee: when does what the receiver believes imply a collision? (The paper's detection of the potential collision.)
 
-A fused list implies one when the object, keeping its perceived velocity from its perceived place, will within the horizon
-be in the ego's corridor: what the ego, at its present speed, will sweep of its own path, and a margin around it. Ways are
-compared, not times: nobody is expected to be exactly in time.
+A fused list implies one when the object, keeping its perceived velocity from its perceived place, will within the
+horizon be in the ego's corridor: what the ego, at its present speed, will sweep of its own path, and a margin around
+it. Ways are compared, not times: nobody is expected to be exactly in time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.braking.boxes import pose_on
-from copem_replay.braking.encounter import EgoCourse
+from copem_replay.braking.course import EgoCourse
 from copem_replay.experiment import Confirm, Conflict
 from copem_replay.fusion.ideal import Belief
 from copem_replay.onset import Looks
@@ -19,7 +19,9 @@ from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 _PIECE_M = 2.0
-"""Length of the straight pieces a corridor is made of, at most (chosen)."""
+"""Length of the straight pieces a corridor is made of (chosen)."""
+_PIECES = 500
+"""More pieces than this are not made: they are longer then (chosen: a kilometre)."""
 
 
 def foreseen(
@@ -59,7 +61,7 @@ def corridors(ego: EgoCourse, now_s: Float, wanted: Conflict) -> tuple[Float, In
     """
     course = ego.course(now_s)
     ahead_m = np.where(np.isnan(course.along_m), np.nan, course.speed_mps * wanted.horizon_s)
-    count = np.where(np.isnan(ahead_m), 0, np.maximum(np.ceil(np.nan_to_num(ahead_m) / _PIECE_M), 1)).astype(np.int64)
+    count = np.where(np.isnan(ahead_m), 0, np.clip(np.ceil(np.nan_to_num(ahead_m) / _PIECE_M), 1, _PIECES)).astype(np.int64)
     bounds = np.concatenate([[0], np.cumsum(count)])
     pieces = np.empty((bounds[-1], 5))
     size = ego.size_m + 2 * wanted.margin_m
@@ -69,17 +71,25 @@ def corridors(ego: EgoCourse, now_s: Float, wanted: Conflict) -> tuple[Float, In
 
 @nb.njit(cache=True, nogil=True)
 def _cover(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pieces: Float) -> None:
+    """Each piece lies as the ego does halfway along it, and reaches as far as the path does in between."""
     for k in range(len(along)):
         n = bounds[k + 1] - bounds[k]
         for j in range(n):
-            x0, y0, yaw0 = pose_on(path, along[k] + ahead[k] * j / n)
-            x1, y1, _ = pose_on(path, along[k] + ahead[k] * (j + 1) / n)
-            way = np.hypot(x1 - x0, y1 - y0)
-            yaw = np.arctan2(y1 - y0, x1 - x0) if way > 1e-3 else yaw0
+            from_m, to_m = along[k] + ahead[k] * j / n, along[k] + ahead[k] * (j + 1) / n
+            x, y, yaw = pose_on(path, (from_m + to_m) / 2)
+            c, s = np.cos(yaw), np.sin(yaw)
+            low, high, right, left = 0.0, 0.0, 0.0, 0.0
+            first = np.searchsorted(path[:, 0], from_m)
+            last = np.searchsorted(path[:, 0], to_m)
+            for v in range(first - 1, last + 1):
+                at_m = from_m if v < first else to_m if v == last else path[v, 0]
+                px, py, _ = pose_on(path, at_m)
+                u, w = c * (px - x) + s * (py - y), -s * (px - x) + c * (py - y)
+                low, high, right, left = min(low, u), max(high, u), min(right, w), max(left, w)
+            u, w = (low + high) / 2, (right + left) / 2
             piece = pieces[bounds[k] + j]
-            piece[0], piece[1], piece[2], piece[3], piece[4] = (
-                (x0 + x1) / 2, (y0 + y1) / 2, yaw, way + size[0], size[1]
-            )  # fmt: skip
+            piece[0], piece[1], piece[2] = x + c * u - s * w, y + s * u + c * w, yaw
+            piece[3], piece[4] = size[0] + high - low, size[1] + left - right
 
 
 @nb.njit(cache=True, nogil=True)
@@ -105,8 +115,8 @@ def _will_be_in(
 ) -> bool:
     """Whether a box that moves on straight without turning meets a standing one within the horizon.
 
-    At any instant two rectangles overlap unless an axis of either separates them, and each axis stops and starts to do so
-    at one instant each.
+    At any instant two rectangles overlap unless an axis of either separates them, and each axis stops and starts to do
+    so at one instant each.
     """
     dx, dy = x - piece[0], y - piece[1]
     first, last = 0.0, horizon_s

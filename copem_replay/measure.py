@@ -73,7 +73,7 @@ def _columns(
 
     result = known.detections
     detection_s = flat(result.detection_s)
-    distance_m, gap_m = _distances(scene, truth, experiment, flat(found.object_ix), detection_s)
+    distance_m, gap_m = distances(scene, truth, experiment, flat(found.object_ix), detection_s)
     onset_s = flat(found.onset_s)
     names = np.array([*known.units, None], dtype=object)  # −1: none
     columns: dict[str, Any] = {
@@ -100,20 +100,24 @@ def _columns(
             "conflict_detected": ~np.isnan(foreseen_s),
             "conflict_detection_s": foreseen_s,
             "time_to_conflict_detection_s": foreseen_s - onset_s,
-            "distance_at_conflict_detection_m": _distances(
-                scene, truth, experiment, flat(found.object_ix), foreseen_s
-            )[0],
+            "distance_at_conflict_detection_m": distances(scene, truth, experiment, flat(found.object_ix), foreseen_s)[
+                0
+            ],
         }
     return columns
 
 
 def _delays(scene: Scene, experiment: Experiment, found: Looks, runs: Int) -> Float | None:
-    """(S, M) seconds the driver takes to react: one per object and run, in every configuration. None without braking."""
+    """(S, M) seconds the driver takes to react to each object, the same in every configuration. None without braking.
+
+    Addressed by the object and the onset's stamp: what is reacted to, not when it came to be known.
+    """
     if experiment.braking is None:
         return None
     none = np.zeros(len(found.object_ix), dtype=np.int64)
     words = object_words([scene.object_ids[k] for k in found.object_ix])
-    uniform = Dice(experiment.seed, scene.log).uniform("reaction", Address(("",), none, words, none), runs)
+    stamp_ns = scene.t0_ns + np.rint(found.onset_s * 1e9).astype(np.int64)
+    uniform = Dice(experiment.seed, scene.log).uniform("reaction", Address(("",), none, words, stamp_ns), runs)
     return delays_of(experiment.braking.driver.reaction, uniform.ravel()).reshape(uniform.shape)
 
 
@@ -136,11 +140,12 @@ def _braking(
         verdicts = judge(encounter, braking.driver, np.where(np.isnan(brake_s[:, m]), np.inf, brake_s[:, m]))
         for name, values in numbers.items():
             values[:, m] = getattr(verdicts, name)
-    passed = np.where(in_conflict, numbers["min_distance_m"] > braking.margin_m, None)
+    passed = pd.array((numbers["min_distance_m"] > braking.margin_m).ravel(), dtype="boolean")
+    passed[~in_conflict.ravel()] = pd.NA
     return {
         "conflict": in_conflict.ravel(),
         "brake_s": np.where(in_conflict, brake_s, np.nan).ravel(),
-        "braking_pass": pd.array(passed.ravel(), dtype="boolean"),
+        "braking_pass": passed,
         "min_distance_m": numbers["min_distance_m"].ravel(),
         "impact_s": numbers["impact_s"].ravel(),
         "impact_speed_mps": numbers["impact_speed_mps"].ravel(),
@@ -148,7 +153,7 @@ def _braking(
     }
 
 
-def _distances(
+def distances(
     scene: Scene, truth: Tracks, experiment: Experiment, object_ix: Int, time_s: Float
 ) -> tuple[Float, Float]:
     """Centre distance and gap of objects (K,) at times (K,); NaN where the time is, or where one is absent.

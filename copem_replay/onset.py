@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.errors import ExperimentError
-from copem_replay.experiment import Appears, At, Experiment, InRange, LineOfSight, Measure, StartsMoving
+from copem_replay.experiment import Appears, At, Carriers, Experiment, InRange, LineOfSight, Measure, StartsMoving
 from copem_replay.resample import states_at, wrap
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.units import carrier, moved, observers, poses, unit_ground
@@ -176,9 +176,18 @@ def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: Experiment
 
 
 def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: Experiment, *, ego_only: bool) -> Float:
-    """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none."""
+    """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
+
+    Units that only some runs have do not count: an onset is the same in all of them.
+    """
     ego_carriers = {"ego", scene.object_ids[scene.ego_ix]} if scene.ego_ix >= 0 else set()
-    chosen = {n: u for n, u in experiment.units.items() if not ego_only or u.on in ego_carriers}
+    chosen = {
+        name: unit
+        for name, unit in experiment.units.items()
+        if not isinstance(unit.on, Carriers) and (not ego_only or unit.on in ego_carriers)
+    }
+    if not chosen:
+        return np.zeros(len(truth.frame_ix))
     places = [poses(scene, u, truth, unit_ground(truth, n, u, [])) for n, u in chosen.items()]
     shares = visible_shares(
         truth,

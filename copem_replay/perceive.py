@@ -29,11 +29,13 @@ def perceive(
     runs: Int,
     *,
     states: Literal["true", "expected", "sampled"] = "sampled",
+    equipped: Bool | None = None,
 ) -> Tracks:
     """Tracks of every unit in the runs (S,): `valid (S, P)` says what was listed.
 
-    States are the true ones (which is all that detection times by truth id need), the expected ones (true state plus
-    the mean error) or sampled. What was listed does not depend on `states`.
+    `equipped (S, U)`: which units there are in each run, None: all. States are the true ones (which is all that
+    detection times by truth id need), the expected ones (true state plus the mean error) or sampled. What was listed
+    does not depend on `states`.
     """
     tracks = found.tracks
     dice = Dice(experiment.seed, scene.log)
@@ -44,6 +46,8 @@ def perceive(
         tracks.stamp_ns[tracks.frame_ix],
     )
     valid = dice.bernoulli("detection", address, runs, found.probability)
+    if equipped is not None:
+        valid &= equipped[:, tracks.row_unit_ix]
     seen = replace(tracks, valid=valid)
     if states == "true":
         return seen

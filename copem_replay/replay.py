@@ -6,15 +6,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.braking.encounter import EgoCourse, Encounter, encounters
+from copem_replay.braking.course import EgoCourse
+from copem_replay.braking.encounter import Encounter, encounters
+from copem_replay.braking.verdict import passing
 from copem_replay.candidates import Candidates, candidates
 from copem_replay.detect import detect
 from copem_replay.experiment import Configuration, Experiment
+from copem_replay.fleet import Fleet, fleet_of
 from copem_replay.foresee import foreseen
 from copem_replay.fusion.ideal import Belief, draw_posterior, fuse
 from copem_replay.fusion.inbox import inbox
@@ -41,21 +45,31 @@ class Replay:
     """One log made ready: nothing in it depends on the run or on a configuration."""
 
     scene: Scene
+    fleet: Fleet  # the experiment's units over this log
     truth: Tracks  # the world at its own frames, short gaps filled
     found: Candidates
     measured: Candidates  # the rows of objects that are looked at
     looks: Looks
     encounters: tuple[Encounter, ...]  # those in conflict
 
+    @cached_property
+    def passing_s(self) -> dict[int, Float]:
+        """For each look in conflict the beginnings of braking (K, 2), from and to, with which the ego passes."""
+        braking = self.fleet.experiment.braking
+        if braking is None:
+            return {}
+        return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
+
 
 def prepare(recording: Recording, experiment: Experiment) -> Replay:
     """Everything about a log that all runs and configurations share."""
     scene = recording.scene
+    fleet = fleet_of(experiment, scene)
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    found = candidates(scene, truth, experiment)
+    found = candidates(scene, truth, fleet.experiment)
     on = looks(scene, truth, found.static, experiment)
     meeting = encounters(scene, truth, on, experiment)
-    return Replay(scene, truth, found, found.of_objects(on.object_ix), on, meeting)
+    return Replay(scene, fleet, truth, found, found.of_objects(on.object_ix), on, meeting)
 
 
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
@@ -71,7 +85,9 @@ def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
 
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
     """The rows of `detections.parquet` of one block of runs (S,)."""
-    seen = perceive(replay.scene, replay.measured, experiment, runs, states="true")
+    experiment = fleet_of(experiment, replay.scene).experiment
+    equipped = replay.fleet.equipped(replay.scene.log, runs)
+    seen = perceive(replay.scene, replay.measured, experiment, runs, states="true", equipped=equipped)
     results: dict[str, Events] = {}
     for name, configuration in experiment.configurations.items():
         heard = listen(seen, replay.truth, experiment, configuration)
@@ -119,17 +135,17 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Beli
     return dict(_beliefs(replay, replay.found, experiment, np.array([run])))
 
 
-def _beliefs(
-    replay: Replay, found: Candidates, experiment: Experiment, runs: Int
-) -> Iterator[tuple[str, Belief]]:
+def _beliefs(replay: Replay, found: Candidates, experiment: Experiment, runs: Int) -> Iterator[tuple[str, Belief]]:
     """Fused lists in the runs (S,), made of the rows of `found`."""
     ego = replay.scene.ego_ix
+    experiment = fleet_of(experiment, replay.scene).experiment
+    equipped = replay.fleet.equipped(replay.scene.log, runs)
     seen: dict[bool, Tracks] = {}  # by whether the states are the expected ones; each is made when first needed
     for name, configuration in experiment.configurations.items():
         posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
         if posterior not in seen:
             states: Literal["expected", "sampled"] = "expected" if posterior else "sampled"
-            seen[posterior] = perceive(replay.scene, found, experiment, runs, states=states)
+            seen[posterior] = perceive(replay.scene, found, experiment, runs, states=states, equipped=equipped)
         heard = listen(seen[posterior], replay.truth, experiment, configuration)
         belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
         if configuration.units != TRUTH:
@@ -138,7 +154,11 @@ def _beliefs(
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
-    """For each configuration how many intervals between fused lists there are, and the seconds they cover."""
+    """For each configuration how many intervals between fused lists there are, and the seconds they cover.
+
+    Units that only some runs have are taken to be there.
+    """
+    experiment = fleet_of(experiment, replay.scene).experiment
     rates = {}
     for name, configuration in experiment.configurations.items():
         heard = listen(replay.measured.tracks, replay.truth, experiment, configuration)

@@ -22,9 +22,10 @@ import pandas as pd
 from copem_replay.check import place_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
+from copem_replay.fleet import of_run
 from copem_replay.plain_yaml import dump
 from copem_replay.read import Recording
-from copem_replay.replay import believed
+from copem_replay.replay import believed, prepare
 from copem_replay.run import Result, log_path_of, shown_logs, shown_run
 
 _LIBRARIES = (
@@ -104,6 +105,10 @@ def _fill(
     (scratch / _EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
     write_csv(result.summary, scratch / "summary.csv")
+    if result.exact is not None:
+        write_parquet(result.exact, scratch / "exact.parquet")
+    if result.sweep is not None:
+        write_csv(result.sweep, scratch / "sweep.csv")
     notes = list(result.notes)
     for log in shown_logs(experiment, result):
         target = scratch / "replay" if len(recordings) == 1 else scratch / "replay" / log
@@ -121,7 +126,10 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     number = shown_run(experiment, result, log)
     assert number is not None  # shown_logs names none otherwise
     replay = next(r for r in result.replays if r.scene.log == log)
-    beliefs = believed(replay, experiment, number)
+    alone = of_run(experiment, replay.scene, number)
+    if alone is not experiment:  # with the units that this run has
+        replay = prepare(next(r for r in recordings if r.scene.log == log), alone)
+    beliefs = believed(replay, alone, number)
     rows = result.table[(result.table["log"] == log) & (result.table["run"] == number)]
     manifest = {
         "copem_replay": version("copem-replay"),
@@ -133,7 +141,7 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     write_rrd(
         Path(f"{target}.rrd"),
         replay,
-        experiment,
+        alone,
         {n: b.fused for n, b in beliefs.items()},
         rows,
         result.summary,
@@ -163,6 +171,7 @@ def provenance_of(
         "visibility": experiment.visibility,
         "max_gap_s": experiment.max_gap_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
+        "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
         "run_shown": {log: shown_run(experiment, result, log) for log in shown_logs(experiment, result)},
         "notes": list(notes),
     }  # fmt: skip

@@ -11,11 +11,13 @@ import numpy as np
 import pandas as pd
 
 from copem_replay import replay as replays
+from copem_replay.exact import exact_table
 from copem_replay.experiment import At, Experiment
 from copem_replay.onset import measured_objects
 from copem_replay.read import Recording
 from copem_replay.replay import Replay
 from copem_replay.summary import horizon_s, summary
+from copem_replay.sweep import Point, points
 from copem_replay.tracks import CLASSES, TRUTH
 
 Progress = Callable[[int, int], None]
@@ -31,6 +33,8 @@ class Result:
     notes: tuple[str, ...]  # what has to be said, one line each
     replays: tuple[Replay, ...]  # one per log
     horizon_s: float | None
+    exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
+    sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
 
 
 def run(
@@ -38,29 +42,72 @@ def run(
 ) -> Result:
     """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks."""
     ready = [replays.prepare(recording, experiment) for recording in recordings]
-    work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, jobs)]
-    parts: list[pd.DataFrame] = []
-    pool = ThreadPoolExecutor(jobs)
-    try:
-        for part in pool.map(lambda item: replays.replay_block(item[0], experiment, item[1]), work):
-            parts.append(part)
-            if progress is not None:
-                progress(len(parts), len(work))
-    finally:  # interrupted: what has not begun never does
-        pool.shutdown(cancel_futures=True)
-    table = _in_order(pd.concat(parts, ignore_index=True), [r.scene.log for r in ready], experiment)
-    rates = [replays.list_rates(replay, experiment) for replay in ready]
+    # Before the runs: what has no closed form is refused at once.
+    exact = _exactly(ready, experiment)
+    tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)))
+    table = tables.of(ready, experiment)
     horizon = horizon_s(table, experiment.measure.horizon_s)
     rows, said = summary(
         table,
         list(experiment.configurations),
-        {name: _rate([r[name] for r in rates]) for name in experiment.configurations},
+        _rates(ready, experiment),
         seed=experiment.seed,
         horizon_s=horizon,
+        exact=exact,
     )
+    swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
     notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
-    return Result(table, rows, (*notes, *said), tuple(ready), horizon)
+    sweep = pd.concat(swept, ignore_index=True) if swept else None
+    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, sweep)
+
+
+def _at_point(
+    point: Point, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables, horizon: float | None
+) -> pd.DataFrame:
+    """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
+    experiment = point.experiment
+    if point.sweep in ("rate_hz", "share"):
+        ready = [replays.prepare(recording, experiment) for recording in recordings]
+    rows, _ = summary(
+        tables.of(ready, experiment),
+        list(experiment.configurations),
+        _rates(ready, experiment),
+        seed=experiment.seed,
+        horizon_s=horizon,
+        exact=_exactly(ready, experiment),
+    )
+    rows.insert(0, "sweep", point.sweep)
+    rows.insert(1, "value", point.value)
+    return rows
+
+
+def _exactly(ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame | None:
+    if not experiment.measure.exact:
+        return None
+    return pd.concat([exact_table(replay, experiment) for replay in ready], ignore_index=True)
+
+
+class _Tables:
+    """Tables of all logs and runs, computed in blocks by several workers; tells how far it is."""
+
+    def __init__(self, jobs: int, progress: Progress | None, tables: int) -> None:
+        self._jobs, self._progress, self._tables, self._done = jobs, progress, tables, 0
+
+    def of(self, ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame:
+        """The rows of `detections.parquet` of an experiment."""
+        work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, self._jobs)]
+        parts: list[pd.DataFrame] = []
+        pool = ThreadPoolExecutor(self._jobs)
+        try:
+            for part in pool.map(lambda item: replays.replay_block(item[0], experiment, item[1]), work):
+                parts.append(part)
+                if self._progress is not None:
+                    self._progress(self._done * len(work) + len(parts), self._tables * len(work))
+        finally:  # interrupted: what has not begun never does
+            pool.shutdown(cancel_futures=True)
+        self._done += 1
+        return _in_order(pd.concat(parts, ignore_index=True), [replay.scene.log for replay in ready], experiment)
 
 
 def _in_order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> pd.DataFrame:
@@ -69,6 +116,11 @@ def _in_order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> p
     configuration = table["configuration"].map({n: k for k, n in enumerate(experiment.configurations)}).to_numpy()
     order = np.lexsort((table["run"].to_numpy(), configuration, log))
     return table.iloc[order].reset_index(drop=True)
+
+
+def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float | None]:
+    rates = [replays.list_rates(replay, experiment) for replay in ready]
+    return {name: _rate([of_log[name] for of_log in rates]) for name in experiment.configurations}
 
 
 def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:

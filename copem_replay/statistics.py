@@ -39,12 +39,16 @@ SHARE_TOLERANCE = 1e-12
 """A share this little below a quantile's level has reached it: 0.07 · 100 is 7, not 7.000000000000001."""
 
 
-def cumulative_incidence(time_s: Float, ending: NDArray[np.integer[Any]]) -> tuple[Float, Float]:
+def cumulative_incidence(
+    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float | None = None, *, least: float = 1e-12
+) -> tuple[Float, Float]:
     """Estimate the cumulative incidence of detection, departure competing: a right-continuous step function.
 
     `time_s (n,)`: seconds from the onset to the detection, or to when looking ended; finite, may be negative.
     `ending (n,)`: `DETECTED`, `LEFT` or `CENSORED`. Of equal times, detections and departures come before
     censorings: who is censored at t was looked at until t, t included.
+    `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: what
+    share of all weight is still somebody to whom the weight of the censored goes.
 
     Returns `times_s (M,)`, the distinct times of detection, ascending, and `incidence (M,)`, the value from
     each of them (included) to the next. Before the first it is 0, after the last it stays. Both are empty
@@ -55,7 +59,8 @@ def cumulative_incidence(time_s: Float, ending: NDArray[np.integer[Any]]) -> tup
     Source: O. O. Aalen, S. Johansen, "An empirical transition matrix for non-homogeneous Markov chains based
     on censored observations", Scand. J. Statist. 5 (1978) 141–150; one state, left for one of two others.
     """
-    n = _rows(time_s, ending)
+    _rows(time_s, ending)
+    weight = _weights(time_s, weight)
     if not np.isfinite(time_s).all():
         raise ValueError("cumulative_incidence: expected finite times")
     detected, censored = ending == DETECTED, ending == CENSORED
@@ -67,15 +72,38 @@ def cumulative_incidence(time_s: Float, ending: NDArray[np.integer[Any]]) -> tup
     # which c are censored and r' > 0 remain. A detection thus weighs these factors over n: whoever is
     # censored hands his weight on, in equal parts, to all who remain. Without censoring the weights are 1
     # and the incidence is a ratio of whole numbers, which a product over millions of times is not.
-    times_s, detections = np.unique(time_s[detected], return_counts=True)
-    lost_s, lost = np.unique(time_s[censored], return_counts=True)
-    remaining = n - np.searchsorted(np.sort(time_s), lost_s, side="right")
+    times_s, detections = _totals(time_s[detected], weight[detected])
+    lost_s, lost = _totals(time_s[censored], weight[censored])
+    order = np.argsort(time_s, kind="stable")
+    until = np.concatenate([[0.0], np.cumsum(weight[order])])
+    total = until[-1]
+    if total <= 0:
+        raise ValueError("cumulative_incidence: expected a weight above 0")
+    remaining = total - until[np.searchsorted(time_s[order], lost_s, side="right")]
     # Where nobody remains, nobody takes the weight over.
-    factors = 1.0 + lost[remaining > 0] / remaining[remaining > 0]
+    there = remaining > least * total
+    factors = 1.0 + lost[there] / remaining[there]
     weights = np.append(1.0, np.cumprod(factors))
-    weight = weights[np.searchsorted(lost_s, times_s, side="left")]
-    incidence = np.cumsum(detections * weight) / n
+    handed = weights[np.minimum(np.searchsorted(lost_s, times_s, side="left"), len(factors))]
+    incidence = np.cumsum(detections * handed) / total
     return times_s, np.minimum(incidence, 1.0)
+
+
+def _totals(value: Float, weight: Float) -> tuple[Float, Float]:
+    """Distinct values, ascending, and the weight on each."""
+    distinct, place = np.unique(value, return_inverse=True)
+    totals: Float = np.bincount(place, weights=weight, minlength=len(distinct)).astype(float)
+    return distinct, totals
+
+
+def _weights(rows: NDArray[Any], weight: Float | None) -> Float:
+    """(n,) how much each row counts."""
+    if weight is None:
+        return np.ones(len(rows))
+    _check_columns(rows, weight)
+    if not (weight >= 0).all():
+        raise ValueError("expected weights of at least 0")
+    return weight
 
 
 def quantile_time(times_s: Float, incidence: Float, q: float) -> float | None:
@@ -110,23 +138,27 @@ def restricted_mean(times_s: Float, incidence: Float, horizon_s: float) -> float
     return float(horizon_s - incidence[before] @ lengths_s)
 
 
-def quantile_with_never(values: Float, detected: Bool, q: float) -> float | None:
+def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float | None = None) -> float | None:
     """Find the `q`-quantile of rows of which the never detected rank below every value; None: one of them.
 
     The inverse of the empirical distribution function: the smallest value v such that the share of rows at or
     below v, the never detected among them, is at least `q` (to 1e-12). So it is the value of some row.
-    `values (n,)`, any unit, not read where not detected and NaN only there; `detected (n,)`; 0 < `q` ≤ 1.
+    `values (n,)`, any unit, not read where not detected and NaN only there; `detected (n,)`; 0 < `q` ≤ 1;
+    `weight (n,)`: how much each row counts, None: all alike.
 
     Raises ValueError for no rows, for shapes that differ, for NaN where detected, for another `q`.
     """
-    n = _rows(values, detected)
+    _rows(values, detected)
+    weight = _weights(values, weight)
     _check_level(q)
     known = values[detected]
     if np.isnan(known).any():
         raise ValueError("quantile_with_never: expected a value in every detected row, found NaN")
-    rank = max(math.ceil((q - SHARE_TOLERANCE) * n), 1)
-    place = rank - 1 - (n - len(known))
-    return float(np.partition(known, place)[place]) if place >= 0 else None
+    order = np.argsort(known, kind="stable")
+    below = np.concatenate([[weight[~detected].sum()], weight[~detected].sum() + np.cumsum(weight[detected][order])])
+    place = int(np.searchsorted(below, (q - SHARE_TOLERANCE) * weight.sum(), side="left"))
+    place = max(place, 0 if below[0] > 0 else 1)
+    return float(known[order[min(place, len(known)) - 1]]) if place > 0 else None
 
 
 def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from copem_replay.statistics import (
     restricted_mean,
     wilson,
 )
+from copem_replay.tracks import Bool, Float
 
 RESAMPLES = 2000
 """Bootstrap resamples (chosen)."""
@@ -44,22 +45,35 @@ def summary(
     *,
     seed: int,
     horizon_s: float | None,
+    exact: pd.DataFrame | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv`, and what has to be said about them."""
+    """The rows of `summary.csv`, and what has to be said about them. `exact`: the rows of `exact.parquet`."""
     notes: list[str] = []
-    over, cluster = _clusters(table)
+    over, _ = _clusters(table)
     if over is None and len(table):
         notes.append(
             f"no interval of the detected share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
             "measured objects, and more runs do not tell about other traffic"
         )
-    groups = table.groupby("configuration", sort=False)
+    parts = _by_configuration(table)
+    exactly = _by_configuration(exact) if exact is not None else {}
     rows = []
     for name in configurations:
-        part = groups.get_group(name) if name in groups.groups else table.iloc[:0]
+        part = parts.get(name, table.iloc[:0])
         row: dict[str, object] = {"configuration": name, "n": len(part), "list_rate_hz": list_rate_hz[name]}
-        rows.append(row | _of_one(part, over, cluster.loc[part.index], seed, horizon_s))
+        row |= _of_one(part, seed, horizon_s)
+        if "conflict_detected" in table:
+            row |= _foreseen(part, horizon_s)
+        if "conflict" in table:
+            row |= _verdicts(part[part["conflict"]], seed)
+        if exact is not None:
+            row |= _exactly(exactly.get(name, exact.iloc[:0]), horizon_s, len(part))
+        rows.append(row)
     return pd.DataFrame(rows), notes
+
+
+def _by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    return {str(name): part for name, part in table.groupby("configuration", sort=False)}
 
 
 def _clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
@@ -72,52 +86,119 @@ def _clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
     return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing
 
 
-def _of_one(
-    part: pd.DataFrame, over: str | None, cluster: pd.Series, seed: int, horizon_s: float | None
-) -> dict[str, object]:
+_TIMES = ("ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m", "dad_p5_m")
+_EXACT = ("detected_share", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "dad_median_m", "dad_p5_m")
+
+
+def _of_one(part: pd.DataFrame, seed: int, horizon_s: float | None) -> dict[str, object]:
     detected = part["detected"].to_numpy(dtype=bool)
-    low, high = _interval(detected, over, cluster, seed) if len(part) else (None, None)
-    left = (part["ended_by"] == "object_left").to_numpy()
-    ending = np.where(detected, DETECTED, np.where(left, LEFT, CENSORED))
-    looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
-    time_s = np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), looked_s)
-    distance_m = part["distance_at_detection_m"].to_numpy(dtype=float)
-    placed = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
+    over, low, high = _interval(part, detected, seed)
     row: dict[str, object] = {
         "detected_share": detected.mean() if len(part) else None,
         "detected_share_low": low,
         "detected_share_high": high,
-        "interval": {"runs": "wilson", None: None}.get(over, "bootstrap") if len(part) else None,
-        "interval_over": over if len(part) else None,
+        "interval": _kind(over) if len(part) else None,
+        "interval_over": over,
     }
+    return row | _times(part, detected, horizon_s)
+
+
+def _times(
+    part: pd.DataFrame, detected: Bool, horizon_s: float | None, weight: Float | None = None, least: float = 1e-12
+) -> dict[str, float | None]:
+    """Quantiles and mean of the time to detection, quantiles of the distance; rows count by `weight (n,)`."""
     if not len(part):
-        return row | dict.fromkeys(
-            ("ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m", "dad_p5_m")
-        )
-    times, incidence = cumulative_incidence(time_s, ending)
-    return row | {
+        return dict.fromkeys(_TIMES)
+    left = (part["ended_by"] == "object_left").to_numpy()
+    ending = np.where(detected, DETECTED, np.where(left, LEFT, CENSORED))
+    looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
+    time_s = np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), looked_s)
+    times, incidence = cumulative_incidence(time_s, ending, weight, least=least)
+    distance_m = part["distance_at_detection_m"].to_numpy(dtype=float)
+    placed = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
+    ranked = (distance_m[placed], detected[placed])
+    by = None if weight is None else weight[placed]
+    some = placed.any()
+    return {
+        "ttd_p5_s": quantile_time(times, incidence, 0.05),
         "ttd_median_s": quantile_time(times, incidence, 0.5),
         "ttd_p95_s": quantile_time(times, incidence, 0.95),
         "ttd_rmst_s": restricted_mean(times, incidence, horizon_s) if horizon_s is not None else None,
         "ttd_rmst_horizon_s": horizon_s,
-        "dad_median_m": quantile_with_never(distance_m[placed], detected[placed], 0.5) if placed.any() else None,
-        "dad_p5_m": quantile_with_never(distance_m[placed], detected[placed], 0.05) if placed.any() else None,
+        "dad_median_m": quantile_with_never(*ranked, 0.5, by) if some else None,
+        "dad_p5_m": quantile_with_never(*ranked, 0.05, by) if some else None,
     }
 
 
-def _interval(
-    detected: np.ndarray, over: str | None, cluster: pd.Series, seed: int
-) -> tuple[float | None, float | None]:
-    if over is None:
-        return None, None
+def _foreseen(part: pd.DataFrame, horizon_s: float | None) -> dict[str, object]:
+    """The same of the second event: that what is believed implies a collision."""
+    known = {
+        "detected": part["conflict_detected"],
+        "time_to_detection_s": part["time_to_conflict_detection_s"],
+        "distance_at_detection_m": part["distance_at_conflict_detection_m"],
+    }
+    detected = known["detected"].to_numpy(dtype=bool)
+    times = _times(part.assign(**known), detected, horizon_s)
+    return {
+        "conflict_detected_share": detected.mean() if len(part) else None,
+        **{f"conflict_{name}": times[name] for name in ("ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "dad_median_m")},
+    }
+
+
+def _verdicts(part: pd.DataFrame, seed: int) -> dict[str, object]:
+    """The share of the rows in conflict that pass."""
+    passed = part["braking_pass"].to_numpy(dtype=bool)
+    over, low, high = _interval(part, passed, seed)
+    return {
+        "n_conflict": len(part),
+        "pass_share": passed.mean() if len(part) else None,
+        "pass_share_low": low,
+        "pass_share_high": high,
+        "pass_interval": _kind(over) if len(part) else None,
+        "pass_interval_over": over,
+    }
+
+
+def _exactly(part: pd.DataFrame, horizon_s: float | None, n: int) -> dict[str, float | None]:
+    """What the runs tend to, of `exact.parquet`: every look counts the same, its rows by their probability.
+
+    Among `n` rows less than one is nobody: with censoring, a look that is still open with probability 10⁻⁹ would
+    otherwise stand for all that were censored before.
+    """
+    result: dict[str, float | None] = dict.fromkeys(_EXACT)
+    if len(part):
+        part = part[part["probability"] > 0]
+        weight = part["probability"].to_numpy(dtype=float)
+        detected = part["detection_s"].notna().to_numpy()
+        result = {"detected_share": weight[detected].sum() / weight.sum()}
+        result |= _times(part, detected, horizon_s, weight, 1 / n)
+    row = {f"{name}_exact": result[name] for name in _EXACT}
+    if "conflict" in part:
+        judged = part[part["conflict"]]
+        weight = judged["probability"].to_numpy(dtype=float)
+        passes = judged["pass_probability"].to_numpy(dtype=float)
+        row["pass_share_exact"] = float(weight @ passes / weight.sum()) if len(judged) else None
+    return row
+
+
+def _kind(over: str | None) -> str | None:
+    return {"runs": "wilson", None: None}.get(over, "bootstrap")
+
+
+def _interval(part: pd.DataFrame, success: Bool, seed: int) -> tuple[str | None, float | None, float | None]:
+    """What is resampled whole, and the limits of the share of successes over it."""
+    over, cluster = _clusters(part)
+    if over is None or not len(part):
+        return None, None, None
     if over == "runs":
-        return wilson(int(detected.sum()), len(detected))
-    counted = pd.Series(detected).groupby(cluster.to_numpy(), sort=True).agg(["sum", "count"])
+        return over, *wilson(int(success.sum()), len(success))
+    counted = pd.Series(success).groupby(cluster.to_numpy(), sort=True).agg(["sum", "count"])
     names = [str(name) for name in counted.index]
     # Addressed by the clusters' names: every configuration resamples the same logs or objects.
     zeros = np.zeros(len(names), dtype=np.int64)
     address = Address(("",), zeros, object_words(names), zeros)
     uniform = Dice(seed, "summary").uniform("bootstrap", address, np.arange(RESAMPLES))
-    return bootstrap_share(
+    limits = bootstrap_share(
         counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), uniform=uniform
     )
+    return over, *limits

@@ -6,21 +6,44 @@ import pandas as pd
 
 
 def summary_text(summary: pd.DataFrame) -> str:
-    """The summary for a terminal: the columns of `summary.csv`, an interval in one cell, what is common below."""
-    shown = summary.drop(columns=["interval", "interval_over", "ttd_rmst_horizon_s"])
-    low, high = shown.pop("detected_share_low"), shown.pop("detected_share_high")
-    interval = [f"[{_cell(a)}, {_cell(b)}]" if pd.notna(a) else "–" for a, b in zip(low, high, strict=True)]
-    shown.insert(shown.columns.get_loc("detected_share") + 1, "95 %", interval)
-    lines = [as_text(shown)]
-    over = summary["interval_over"].dropna()
-    if len(over):
-        lines.append(f"95 %: {summary['interval'].dropna().iloc[0]} interval over {over.iloc[0]}")
+    """The summary for a terminal: what was known and when, then what braking would have made of it."""
+    columns = [
+        "configuration",
+        "n",
+        "list_rate_hz",
+        "detected_share",
+        "95 %",
+        "ttd_median_s",
+        "ttd_p95_s",
+        "ttd_rmst_s",
+    ]
+    shown = summary.assign(**{"95 %": _intervals(summary, "detected_share")})
+    lines = [as_text(shown[[*columns, "dad_median_m", "dad_p5_m"]])]
+    lines += _over(summary, "interval")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
         lines.append(
             f"ttd_rmst_s: mean time to detection, never detected counting as {_cell(float(horizon.iloc[0]))} s"
         )
+    if "pass_share" in summary:
+        verdicts = summary.assign(**{"95 %": _intervals(summary, "pass_share")})
+        exact = ["pass_share_exact"] if "pass_share_exact" in summary else []
+        lines += ["", as_text(verdicts[["configuration", "n_conflict", "pass_share", "95 %", *exact]])]
+        lines += _over(summary, "pass_interval")
+        lines.append(
+            "pass_share: of those in conflict, how many the declared driver, braking when it knew, stays clear of"
+        )
     return "\n".join(lines)
+
+
+def _intervals(summary: pd.DataFrame, of: str) -> list[str]:
+    limits = zip(summary[f"{of}_low"], summary[f"{of}_high"], strict=True)
+    return [f"[{_cell(low)}, {_cell(high)}]" if pd.notna(low) else "–" for low, high in limits]
+
+
+def _over(summary: pd.DataFrame, name: str) -> list[str]:
+    over = summary[f"{name}_over"].dropna()
+    return [f"95 %: {summary[name].dropna().iloc[0]} interval over {over.iloc[0]}"] if len(over) else []
 
 
 def as_text(table: pd.DataFrame) -> str:

@@ -44,7 +44,8 @@ def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
     n = len(world.stamp_ns)
     if unit.at is not None:
         heading = np.full(n, wrap(np.deg2rad(np.array(unit.yaw_deg))))
-        x, y, z = (np.full(n, v) for v in (*unit.at, ground_m))
+        assert unit.height_m is not None  # the experiment says so
+        x, y, z = (np.full(n, v) for v in (*unit.at, ground_m + unit.height_m))
         x, y = moved(x, y, heading, unit.offset_m)
         present = np.ones(n, dtype=bool)
     else:
@@ -54,10 +55,11 @@ def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
         present = np.zeros(n, dtype=bool)
         present[at] = True
         x[at], y[at], yaw[at] = world.x_m[0, rows], world.y_m[0, rows], world.yaw_rad[0, rows]
-        z[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2
+        height_m = world.height_m[0, rows] if unit.height_m is None else unit.height_m  # on the roof
+        z[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2 + height_m
         x, y = moved(x, y, yaw, unit.offset_m)
         heading = wrap(yaw + np.deg2rad(unit.yaw_deg))
-    return Poses(x, y, z + unit.height_m, heading, present)
+    return Poses(x, y, z, heading, present)
 
 
 def moved(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[float, float]) -> tuple[Float, Float]:
@@ -74,6 +76,13 @@ def observers(places: Sequence[Poses], carriers: Int) -> Observers:
         np.stack([p.present for p in places]),
         carriers,
     )
+
+
+def mounting_height(scene: Scene, truth: Tracks, unit: Unit) -> float:
+    """Metres a unit is above the ground: as given, or the height of its carrier when that first appears."""
+    if unit.height_m is not None:
+        return unit.height_m
+    return float(truth.height_m[0, np.flatnonzero(truth.row_object_ix == carrier(scene, unit))[0]])
 
 
 def carrier(scene: Scene, unit: Unit) -> int:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +22,25 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
 
 
-def test_readme_shows_what_its_command_prints(
+def test_readme_shows_what_its_commands_print(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    found = re.findall(r"<!-- output: copem-replay (.*?) -->\n```text\n(.*?)```", text, re.DOTALL)
-    assert found
+    found = re.findall(r"<!-- output: (.*?) -->\n```text\n(.*?)```", text, re.DOTALL)
+    assert [command.split()[0] for command, _ in found] == ["copem-replay", "python"]
+    out = tmp_path / "results"
+    monkeypatch.chdir(ROOT)
     for command, expected in found:
-        words = shlex.split(command)
-        out = tmp_path / "results"
-        words[words.index("--out") + 1] = str(out)
-        monkeypatch.setattr("sys.argv", ["copem-replay", *words])
-        monkeypatch.chdir(ROOT)
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert ended.value.code == 0
-        assert capsys.readouterr().out.replace(str(out), "out/tc016d") == expected
+        words = [str(out) if word == "out/tc016d" else word for word in shlex.split(command)]
+        if words[0] == "python":
+            printed = subprocess.run([sys.executable, *words[1:]], check=True, capture_output=True, text=True).stdout
+        else:
+            monkeypatch.setattr("sys.argv", words)
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            assert ended.value.code == 0
+            printed = capsys.readouterr().out
+        assert printed.replace(str(out), "out/tc016d") == expected
 
 
 def test_readme_experiment_loads(tmp_path: Path) -> None:

@@ -273,15 +273,19 @@ COPEM = "  coPEM: {units: all, %s}", "16: configurations.coPEM"
 MEASURE = "measure: {%s}", "17: measure"
 SHOW = "show: %s", "18: show"
 OBSTACLES = "obstacles: %s", "19: obstacles"
+BRAKING = "braking: %s", "19: braking"
+DRIVER = "braking: {driver: {%s}}", "19: braking.driver"
+SWEEP = "sweep: %s", "19: sweep"
 """What a line looks like, and how a problem with it begins."""
 
 KEYS = (
-    "configurations, ego, logs, max_gap_s, measure, obstacles, pems, read, runs, seed, show, units, version, visibility"
+    "braking, configurations, ego, logs, max_gap_s, measure, obstacles, pems, read, runs, seed, show, sweep, units, "
+    "version, visibility"
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"
 ONSETS = "'starts_moving', 'appears', 'in_range', 'line_of_sight', 'line_of_sight_any', 'at'"
 KINDS = "expected {kind: …}, kind one of visible_share, constant, table; found "
-PLACE = "expected one of `on: ego`, `on: <object id>` and `at: [x, y]`"
+PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`"
 CASES = [
     (TOP, "version: 2", "1: version: expected 1, found 2"),
     (TOP, "version: '1'", "1: version: expected 1, found '1'"),
@@ -350,7 +354,15 @@ CASES = [
      ": phase_s: needs rate_hz (without it there is one list per frame of the truth)"),
     (UNIT, "on: ego, height_m: 1, pem: onboard, rate_hz: 0", ".rate_hz: expected at least 0.001, found 0"),
     (UNIT, "on: ego, height_m: 1, pem: onboard, rate_hz: 1e9", ".rate_hz: expected at most 1000, found 1000000000.0"),
-    (UNIT, "on: ego, height: 1, pem: onboard", ".height_m: missing", ".height: unknown key; did you mean height_m?"),
+    (UNIT, "on: ego, height: 1, pem: onboard", ".height: unknown key; did you mean height_m?"),
+    (UNIT, "at: [0, 0], pem: onboard",
+     ": height_m: needed for a unit `at` a place; only a carried one is on a roof by default"),
+    (UNIT, "on: {classes: [cra], share: 2}, pem: onboard",
+     ".on.classes[0]: expected one of pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, "
+     "vehicle, vru, vehicles; found 'cra'",
+     ".on.share: expected at most 1, found 2"),
+    (UNIT, "on: {classes: [car]}, pem: onboard", ".on.share: missing"),
+    (UNIT, "on: [1], pem: onboard", ".on: expected text, found [1]"),
     (UNIT, "on: ego, height_m: -1, pem: onboard", ".height_m: expected at least 0, found -1"),
     (UNIT, "on: ego, height_m: '1', pem: onboard", ".height_m: expected a number, found '1'"),
     (MAST, "at: [0], height_m: 1, pem: onboard", ".at[1]: missing"),
@@ -358,6 +370,28 @@ CASES = [
      ".at[0]: expected a number, found 'a'",
      ".at[1]: expected at most 1e+12, found 1e+300"),
     (MAST, "at: 5, height_m: 1, pem: onboard", ".at: expected a list, found 5"),
+    (BRAKING, "{}", ".driver: missing"),
+    (BRAKING, "{driver: hard}",
+     ".driver: expected {kind: …}, kind one of constant_deceleration; found 'hard'"),
+    (BRAKING, "{driver: {kind: constant_deceleration, a_max_mps2: 8}, margin: 1}",
+     ".margin: unknown key; did you mean margin_m?"),
+    (BRAKING, "{driver: {kind: constant_deceleration, a_max_mps2: 8}, ego: frozen}",
+     ".ego: expected 'recorded' or 'constant_speed', found 'frozen'"),
+    (DRIVER, "kind: constant_deceleration", ".a_max_mps2: missing"),
+    (DRIVER, "kind: constant_deceleration, a_max_mps2: 0", ".a_max_mps2: expected at least 0.01, found 0"),
+    (DRIVER, "kind: constant_deceleration, a_max_mps2: 8, reaction: {kind: gama, shape: 1, mean_s: 1}",
+     ".reaction: kind: expected one of constant, gamma, lognormal, or package.module:Class; found 'gama'"),
+    (DRIVER, "kind: constant_deceleration, a_max_mps2: 8, reaction: {kind: gamma, shape: 1}",
+     ".reaction.mean_s: missing"),
+    (MEASURE, "conflict: {horizon_s: 0}", ".conflict.horizon_s: expected more than 0, found 0"),
+    (MEASURE, "exact: yes", ".exact: expected true or false, found 'yes'"),
+    (SWEEP, "{}",
+     ": expected values of latency_s, rate_hz, units or share, such as `latency_s: [0, 0.5, 1]`"),
+    (SWEEP, "{latency_s: 1}", ".latency_s: expected a list, found 1"),
+    (SWEEP, "{units: [1.5, -1]}",
+     ".units[0]: expected a whole number, found 1.5",
+     ".units[1]: expected at least 0, found -1"),
+    (SWEEP, "{latency: [1]}", ".latency: unknown key; did you mean latency_s?"),
     (PEM, "", ": expected keys and values, found nothing"),
     (PEM, "{}", ".units: missing"),
     (PEM, "{units: ego}", ".units: expected 'truth' or 'all', or a list, found 'ego'"),

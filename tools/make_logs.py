@@ -128,10 +128,14 @@ _EGO_START_M: Final = -(20.0 + 4.6 / 2 + 10.0 * TC016D_ONSET_S) + 1e-10
 """At the onset its front is 20 m from the pedestrian; 0.1 nm less, or rounding might delay it by a frame."""
 
 
-def tc016d_bodies() -> tuple[list[Body], list[Body]]:
+TC016D_TRUCK_EDGE_M: Final = -2.12
+"""Road side of the truck, calibrated (docs/calibration.md)."""
+
+
+def tc016d_bodies(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> tuple[list[Body], list[Body]]:
     """Return what moves and what doesn't. The pedestrian walks along x = 0, the ego drives along y = 0.
 
-    The truck's road side is at y = −2.12 and its front at x = −0.75, half a metre before the pedestrian. Past
+    The truck's road side is at `truck_edge_m` and its front at x = −0.75, half a metre before the pedestrian. Past
     that corner the ego sees nothing of him until 0.5 s after his first step, 18 % at 0.6 s, all at 1.1 s.
     """
     car = Body(id=0, size_m=(4.4, 1.8, 1.5), at_m=(0.0, 0.0), speed_mps=10.0)
@@ -139,7 +143,7 @@ def tc016d_bodies() -> tuple[list[Body], list[Body]]:
     moving = [
         replace(car, id=1, size_m=(4.6, 1.9, 1.5), at_m=(_EGO_START_M, 0.0)),
         replace(walker, id=2, at_m=(0.0, -3.0), yaw_deg=90.0, speed_mps=1.0, starts_s=TC016D_ONSET_S),
-        Body(id=3, size_m=(8.0, 2.5, 3.5), at_m=(-4.75, -3.37), vehicle=Kind.TYPE_HEAVY_TRUCK),
+        Body(id=3, size_m=(8.0, 2.5, 3.5), at_m=(-4.75, truck_edge_m - 1.25), vehicle=Kind.TYPE_HEAVY_TRUCK),
         # Two oncoming cars: one has passed the crossing, the other stops before it because of the pedestrian.
         replace(car, id=4, at_m=(-8.0, 3.5), yaw_deg=180.0, speed_mps=11.0),
         replace(car, id=5, at_m=(100.0, 3.5), yaw_deg=180.0, brakes_s=4.0, deceleration_mps2=1.25),
@@ -169,9 +173,9 @@ def tc016d_units() -> list[dict[str, Any]]:
     ]
 
 
-def tc016d() -> Recording:
+def tc016d(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> Recording:
     """Return the scenario of the paper: a pedestrian steps out from behind a truck, 20 m ahead of the ego."""
-    moving, stationary = tc016d_bodies()
+    moving, stationary = tc016d_bodies(truck_edge_m)
     stamps_ns = (frame * NANOS_PER_SECOND // TC016D_RATE_HZ for frame in range(TC016D_FRAMES))
     return Recording(
         description="A parked truck hides a pedestrian who starts to cross 20 m ahead of the ego vehicle.",

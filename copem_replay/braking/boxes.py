@@ -13,27 +13,25 @@ from copem_replay.tracks import Float
 
 _TOUCH_M = 1e-9
 """Boxes this near touch (chosen: rounding of positions within a few kilometres of the origin)."""
+_FINE_M = 1e-6
+"""A distance that could be smaller by no more than this is not looked into (chosen)."""
 _STRIDE_M = 1e-3
 """The shortest step along a path in search of a contact (chosen: a graze shorter than this may be missed)."""
 
 
 @nb.njit(cache=True, inline="always")
-def _corners_to(ax: float, ay: float, ayaw: float, al: float, aw: float,
-                bx: float, by: float, byaw: float, bl: float, bw: float) -> tuple[float, bool]:  # fmt: skip
-    """Squared distance from the corners of a to the rectangle b, and whether an axis of b separates the two."""
-    cb, sb = np.cos(byaw), np.sin(byaw)
-    x, y = cb * (ax - bx) + sb * (ay - by), -sb * (ax - bx) + cb * (ay - by)
-    c, s = np.cos(ayaw - byaw), np.sin(ayaw - byaw)
-    hl, hw = bl / 2, bw / 2
-    reach_x = abs(c) * al / 2 + abs(s) * aw / 2
-    reach_y = abs(s) * al / 2 + abs(c) * aw / 2
-    apart = abs(x) > hl + reach_x or abs(y) > hw + reach_y
+def _corners_to(
+    x: float, y: float, c: float, s: float, al: float, aw: float, bl: float, bw: float
+) -> tuple[float, bool]:
+    """Squared distance of a box's corners from a rectangle around the origin; whether an axis of that parts the two.
+
+    The box lies at (x, y), turned by an angle with cosine c and sine s, and has the half sizes al and aw.
+    """
+    apart = abs(x) > bl + abs(c) * al + abs(s) * aw or abs(y) > bw + abs(s) * al + abs(c) * aw
     best = np.inf
-    for k in range(4):
-        u = al / 2 if k & 1 else -al / 2
-        v = aw / 2 if k & 2 else -aw / 2
-        dx = max(abs(x + c * u - s * v) - hl, 0.0)
-        dy = max(abs(y + s * u + c * v) - hw, 0.0)
+    for u, v in ((al, aw), (al, -aw), (-al, -aw), (-al, aw)):
+        dx = max(abs(x + c * u - s * v) - bl, 0.0)
+        dy = max(abs(y + s * u + c * v) - bw, 0.0)
         best = min(best, dx * dx + dy * dy)
     return best, apart
 
@@ -42,8 +40,12 @@ def _corners_to(ax: float, ay: float, ayaw: float, al: float, aw: float,
 def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
                  bx: float, by: float, byaw: float, bl: float, bw: float) -> float:  # fmt: skip
     """Horizontal distance of two boxes, m; 0 where they touch or overlap (then no axis of either separates them)."""
-    d1, apart1 = _corners_to(ax, ay, ayaw, al, aw, bx, by, byaw, bl, bw)
-    d2, apart2 = _corners_to(bx, by, byaw, bl, bw, ax, ay, ayaw, al, aw)
+    ca, sa, cb, sb = np.cos(ayaw), np.sin(ayaw), np.cos(byaw), np.sin(byaw)
+    c, s = ca * cb + sa * sb, sa * cb - ca * sb
+    dx, dy = ax - bx, ay - by
+    al, aw, bl, bw = al / 2, aw / 2, bl / 2, bw / 2
+    d1, apart1 = _corners_to(cb * dx + sb * dy, -sb * dx + cb * dy, c, s, al, aw, bl, bw)
+    d2, apart2 = _corners_to(-ca * dx - sa * dy, sa * dx - ca * dy, c, -s, bl, bw, al, aw)
     if not apart1 and not apart2:
         return 0.0
     return float(np.sqrt(min(d1, d2)))
@@ -53,8 +55,6 @@ def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
 def pose_on(path: Float, s: float) -> tuple[float, float, float]:
     """Pose at arc length `s` of a path (V, 4): s, x, y, yaw by vertex. Beyond its ends it goes straight on."""
     n = len(path)
-    if n == 1:
-        return path[0, 1], path[0, 2], path[0, 3]
     k = min(max(int(np.searchsorted(path[:, 0], s)) - 1, 0), n - 2)
     f = (s - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
     turn = min(max(f, 0.0), 1.0)
@@ -85,6 +85,16 @@ def _distance_at(along: Float, path: Float, size: Float, other: Float, other_siz
     )  # fmt: skip
 
 
+@nb.njit(cache=True)
+def turning(path: Float, size: Float) -> float:
+    """How far a corner of the ego moves per metre of its path, at most."""
+    most = 1.0
+    half = np.hypot(size[0], size[1]) / 2
+    for v in range(len(path) - 1):
+        most = max(most, 1.0 + half * abs(path[v + 1, 3] - path[v, 3]) / (path[v + 1, 0] - path[v, 0]))
+    return most
+
+
 @nb.njit(cache=True, nogil=True)
 def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Float, near: Float, touch: Float) -> None:
     """Smallest box distance of each course `along (R, T)` of the ego, and where the boxes first touch.
@@ -92,52 +102,96 @@ def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Fl
     NaN in `along` or in `other (3, T)`: not there. Out: `near (R,)`, metres, inf where they are never there together;
     `touch (R,)`, a place between the instants, inf where they never touch.
     """
-    radii = np.hypot(size[0], size[1]) / 2 + np.hypot(other_size[0], other_size[1]) / 2
     n = along.shape[1]
-    d = np.empty(n)  # distance at each instant, or something below it where it cannot be the smallest
+    most = turning(path, size)
+    half = np.hypot(other_size[0], other_size[1]) / 2
+    moved = np.zeros(n)  # how far a corner of the other has moved since the first instant, at most
+    for k in range(1, n):
+        step = np.hypot(other[0, k] - other[0, k - 1], other[1, k] - other[1, k - 1])
+        step += half * abs(other[2, k] - other[2, k - 1])
+        moved[k] = moved[k - 1] + (0.0 if np.isnan(step) else step)
     for r in range(len(along)):
-        best, touches = np.inf, np.inf
-        last_x = last_y = np.nan
-        step = 0.0  # how far the two moved against each other since the instant before
-        for k in range(n):
-            if np.isnan(along[r, k]) or np.isnan(other[0, k]):
-                d[k] = np.inf
-                last_x = last_y = np.nan
+        best, place = np.inf, np.inf
+        first = 0
+        while first < n and place == np.inf:  # stretches at which both are there
+            if np.isnan(along[r, first]) or np.isnan(other[0, first]):
+                first += 1
                 continue
-            x, y, yaw = pose_on(path, along[r, k])
-            dx, dy = x - other[0, k], y - other[1, k]
-            step = 0.0 if np.isnan(last_x) else np.hypot(dx - last_x, dy - last_y)
-            last_x, last_y = dx, dy
-            d[k] = np.hypot(dx, dy) - radii
-            if d[k] < best + step:
-                d[k] = box_distance(
-                    x, y, yaw, size[0], size[1], other[0, k], other[1, k], other[2, k], other_size[0], other_size[1]
-                )
-            if d[k] <= _TOUCH_M:
-                touches = k if k == 0 or d[k - 1] == np.inf else _first_touch(along[r], path, size, other, other_size, k)
+            last = first
+            while last + 1 < n and not (np.isnan(along[r, last + 1]) or np.isnan(other[0, last + 1])):
+                last += 1
+            best, _ = _search(along[r], path, size, other, other_size, moved, most, first, last, best, False)
+            if best <= _TOUCH_M:
+                _, place = _search(along[r], path, size, other, other_size, moved, most, first, last, _TOUCH_M, True)
                 best = 0.0
-                break
-            best = min(best, d[k])
-            if k >= 2 and d[k - 1] <= d[k] and d[k - 1] <= d[k - 2] and d[k - 1] - 2 * step < best:
-                place, lowest = _lowest(along[r], path, size, other, other_size, k - 2.0, float(k))
-                if lowest <= _TOUCH_M:
-                    touches, best = place, 0.0
-                    break
-                best = min(best, lowest)
-        near[r], touch[r] = best, touches
+            first = last + 1
+        near[r], touch[r] = best, place
 
 
 @nb.njit(cache=True)
-def _first_touch(along: Float, path: Float, size: Float, other: Float, other_size: Float, k: int) -> float:
-    """Where between the instants k − 1 and k, which is in touch, the boxes first touch: by halves."""
-    a, b = k - 1.0, float(k)
+def _search(
+    along: Float, path: Float, size: Float, other: Float, other_size: Float, moved: Float, most: float,
+    first: int, last: int, best: float, touching: bool,
+) -> tuple[float, float]:  # fmt: skip
+    """Smallest distance between two instants if it is below `best`; or, `touching`, the first place not above `best`.
+
+    By halves, the earlier one first. Between two instants it cannot be smaller than half the sum of the distances at
+    them less half of what the two have moved meanwhile; a stretch that thus cannot matter is left out.
+    """
+    stack = np.empty((128, 2), dtype=np.int64)
+    known = np.empty((128, 2))
+    stack[0] = first, last
+    known[0] = (
+        _distance_at(along, path, size, other, other_size, float(first)),
+        _distance_at(along, path, size, other, other_size, float(last)),
+    )
+    if touching and known[0, 0] <= best:
+        return known[0, 0], float(first)
+    best = best if touching else min(best, known[0, 0], known[0, 1])
+    depth = 1
+    while depth:
+        depth -= 1
+        a, b = stack[depth]
+        da, db = known[depth]
+        movement = most * (along[b] - along[a]) + moved[b] - moved[a]
+        if (da + db - movement) / 2 >= best + (1e-12 if touching else -_FINE_M):
+            continue
+        if b - a > 1:
+            m = (a + b) // 2
+            dm = _distance_at(along, path, size, other, other_size, float(m))
+            if not touching:
+                best = min(best, dm)
+            stack[depth], stack[depth + 1] = (m, b), (a, m)
+            known[depth], known[depth + 1] = (dm, db), (da, dm)
+            depth += 2
+            continue
+        # Between neighbours both move straight: the distance is convex, and so above the lines on by its values.
+        dm = _distance_at(along, path, size, other, other_size, (a + b) / 2)
+        if b > a and not touching:
+            best = min(best, dm)
+            if 2 * dm - max(da, db) < best - _FINE_M:
+                best = min(best, _lowest(along, path, size, other, other_size, float(a), float(b))[1])
+        elif b > a:
+            end, d_end = float(b), db
+            if d_end > best:
+                end, d_end = _lowest(along, path, size, other, other_size, float(a), float(b))
+            if d_end <= best:
+                return d_end, _first_touch(along, path, size, other, other_size, float(a), end)
+    return best, np.inf
+
+
+@nb.njit(cache=True)
+def _first_touch(
+    along: Float, path: Float, size: Float, other: Float, other_size: Float, clear: float, within: float
+) -> float:
+    """Where between two places, the second in touch, the boxes first touch: by halves."""
     for _ in range(40):
-        m = (a + b) / 2
+        m = (clear + within) / 2
         if _distance_at(along, path, size, other, other_size, m) <= _TOUCH_M:
-            b = m
+            within = m
         else:
-            a = m
-    return b
+            clear = m
+    return within
 
 
 @nb.njit(cache=True)
@@ -170,10 +224,7 @@ def reach(
     From `from_m` on, at most to `to_m (T,)`; inf where it is never within the margin up to there. The ego advances by
     as much as surely stays clear until nothing is left of it (sphere tracing).
     """
-    half = np.hypot(size[0], size[1]) / 2
-    turning = 1.0  # metres a corner moves per metre of way, at most
-    for v in range(len(path) - 1):
-        turning = max(turning, 1.0 + half * abs(path[v + 1, 3] - path[v, 3]) / (path[v + 1, 0] - path[v, 0]))
+    most = turning(path, size)
     for k in range(other.shape[1]):
         out[k] = np.inf
         if np.isnan(other[0, k]):
@@ -190,10 +241,8 @@ def reach(
             if free <= 0.0:
                 out[k] = _last_clear(path, size, other[:, k], other_size, margin_m, clear, s)
                 break
-            if len(path) == 1:  # it stands
-                break
             clear = s
-            s += max(free / turning, _STRIDE_M)
+            s += max(free / most, _STRIDE_M)
 
 
 @nb.njit(cache=True)
@@ -204,7 +253,10 @@ def _last_clear(
     for _ in range(40):
         s = (clear + within) / 2
         x, y, yaw = pose_on(path, s)
-        if box_distance(x, y, yaw, size[0], size[1], other[0], other[1], other[2], other_size[0], other_size[1]) > margin_m:
+        if (
+            box_distance(x, y, yaw, size[0], size[1], other[0], other[1], other[2], other_size[0], other_size[1])
+            > margin_m
+        ):
             clear = s
         else:
             within = s
@@ -215,8 +267,8 @@ def _last_clear(
 def required(time_s: Float, reach_m: Float, begin_s: Float, begin_m: Float, speed_mps: Float, out: Float) -> None:
     """Smallest constant deceleration (R,) that stays short of `reach_m (T,)` from `begin_s (R,)` on; inf: none does.
 
-    At `begin_s` the ego is at `begin_m (R,)` with `speed_mps (R,)`. To be no farther than g after t: none where v·t ≤ g;
-    2 (v·t − g) / t² where it then still moves; v² / 2 g where it has to stop before.
+    At `begin_s` the ego is at `begin_m (R,)` with `speed_mps (R,)`. To be no farther than g after t: none where
+    v·t ≤ g; 2 (v·t − g) / t² where it then still moves; v² / 2 g where it has to stop before.
     """
     for r in range(len(out)):
         a = 0.0

@@ -12,28 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.braking.boxes import nearest, reach
+from copem_replay.braking.course import Course, EgoCourse
 from copem_replay.experiment import Experiment
 from copem_replay.onset import Looks
-from copem_replay.resample import states_at
-from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.tracks import Float, Int, Scene, Tracks
 
 NODE_S = 0.01
 """Between instants of judgement (chosen: at 10 m/s² a straight line over it is off by 0.13 mm)."""
-
-_SAME_PLACE_M = 1e-6
-
-
-@dataclass(frozen=True)
-class Course:
-    """The ego that does not brake. T instants of one encounter.
-
-    `along_m (T,)` its way from the first vertex of the path, NaN where it is not in the log; `bound_m (T,)` the same with
-    gaps closed, and past its last frame inf: farther than that it never is; `speed_mps (T,)`.
-    """
-
-    along_m: Float
-    bound_m: Float
-    speed_mps: Float
 
 
 @dataclass(frozen=True)
@@ -67,41 +52,6 @@ def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: Experiment
     return tuple(result)
 
 
-class EgoCourse:
-    """The ego's path through the log, and how it drives along it.
-
-    `path (V, 4)`: arc length, x, y, yaw; `size_m (2,)`.
-    """
-
-    def __init__(self, scene: Scene, truth: Tracks, max_gap_s: float) -> None:
-        self._truth, self._scene, self._max_gap_s = truth, scene, max_gap_s
-        rows = np.flatnonzero(truth.row_object_ix == scene.ego_ix)
-        x, y = truth.x_m[0, rows], truth.y_m[0, rows]
-        step = np.hypot(np.diff(x), np.diff(y))
-        self.frame_s = truth.row_captured_s[rows]
-        self.frame_m = np.concatenate([[0.0], np.cumsum(step)])
-        self.frame_mps = np.hypot(truth.vx_mps[0, rows], truth.vy_mps[0, rows])
-        moved = np.concatenate([[True], step > _SAME_PLACE_M])
-        yaw = np.unwrap(truth.yaw_rad[0, rows])
-        self.path = np.stack([self.frame_m, x, y, yaw], axis=1)[moved]
-        self.size_m = np.array([truth.length_m[0, rows[0]], truth.width_m[0, rows[0]]])
-
-    def course(self, time_s: Float, constant_from_s: float | None = None) -> Course:
-        """How it drives at instants (T,): as recorded, or with constant speed from an instant on."""
-        if constant_from_s is not None:
-            start_m, speed = (np.interp(constant_from_s, self.frame_s, v) for v in (self.frame_m, self.frame_mps))
-            along = start_m + speed * (time_s - constant_from_s)
-            return Course(along, along, np.full(len(time_s), speed))
-        bound = np.interp(time_s, self.frame_s, self.frame_m, right=np.inf)
-        _, present = self.states(self._scene.ego_ix, time_s)
-        return Course(np.where(present, bound, np.nan), bound, np.interp(time_s, self.frame_s, self.frame_mps))
-
-    def states(self, object_ix: int, time_s: Float) -> tuple[dict[str, Float], Bool]:
-        """States of any object at instants (T,), and whether it is in the log then."""
-        which = np.full(len(time_s), object_ix)
-        return states_at(self._truth, which, time_s, t0_ns=self._scene.t0_ns, max_gap_s=self._max_gap_s)
-
-
 def _may_meet(
     ego: EgoCourse, truth: Tracks, rows: Int, onset_s: float, constant_from_s: float | None, margin_m: float
 ) -> bool:
@@ -124,8 +74,6 @@ def _may_meet(
 
 def _ahead(path: Float, along_m: Float) -> tuple[Float, Float]:
     """Places (K,) on a path, straight on beyond its ends."""
-    if len(path) == 1:
-        return np.full(len(along_m), path[0, 1]), np.full(len(along_m), path[0, 2])
     k = np.clip(np.searchsorted(path[:, 0], along_m) - 1, 0, len(path) - 2)
     f = (along_m - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
     return path[k, 1] + f * (path[k + 1, 1] - path[k, 1]), path[k, 2] + f * (path[k + 1, 2] - path[k, 2])

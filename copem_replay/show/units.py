@@ -10,7 +10,7 @@ from copem_replay.pem.condition import Condition, Couple
 from copem_replay.replay import Replay
 from copem_replay.show.out import Out, f32, upright
 from copem_replay.show.world import EGO
-from copem_replay.units import Poses, list_instants
+from copem_replay.units import Poses, list_instants, mounting_height
 
 MANY_UNITS = 8
 """With more than these the fixed ones are not named (chosen: twenty names cover the scene)."""
@@ -35,7 +35,8 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
             out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
         mark, named = rr.Radius.ui_points(4), not (many and unit.at is not None)
         out.static(path, rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=named))
-        _field(out, name, unit, at, elapsed_ns, experiment.pems[unit.pem])
+        height_m = mounting_height(replay.scene, replay.truth, unit)
+        _field(out, name, unit, at, elapsed_ns, experiment.pems[unit.pem], height_m)
 
 
 def outlines(pem: tuple[Couple, ...]) -> list[np.ndarray]:
@@ -59,11 +60,13 @@ def _outline(when: Condition) -> list[np.ndarray]:
     return [np.concatenate([inner[-1:], far_m * arc, inner])]
 
 
-def _field(out: Out, name: str, unit: Unit, at: Poses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...]) -> None:
+def _field(
+    out: Out, name: str, unit: Unit, at: Poses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...], height_m: float
+) -> None:
     """The outlines in the unit's own frame, which moves; on the ground under it."""
     import rerun as rr
 
-    down_m = _ABOVE_GROUND_M - unit.height_m
+    down_m = _ABOVE_GROUND_M - height_m
     strips = [f32(*line.T, np.full(len(line), down_m)) for line in outlines(pem)]
     if not strips or not at.present.any():
         return

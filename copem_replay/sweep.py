@@ -1,0 +1,107 @@
+"""Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
+
+A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `share` the units themselves.
+Configurations that it leaves as they are, or makes equal to one before, are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from copem_replay.experiment import Carriers, Configuration, Experiment, Measure, Unit
+from copem_replay.tracks import TRUTH
+
+KINDS = ("latency_s", "rate_hz", "units", "share")
+
+
+@dataclass(frozen=True)
+class Point:
+    """One value of one sweep: `experiment` at that value, with the configurations it changes."""
+
+    sweep: str
+    value: float
+    experiment: Experiment
+
+
+def points(experiment: Experiment) -> Iterator[Point]:
+    """The points of all sweeps of an experiment, sweep by sweep in the order of their values."""
+    if experiment.sweep is None:
+        return
+    for kind in KINDS:
+        values = getattr(experiment.sweep, kind)
+        curves = _curves(experiment, kind, values)
+        for k, value in enumerate(values):
+            at = experiment.model_copy(
+                update={
+                    "configurations": {name: c for name, curve in curves.items() if (c := curve[k]) is not None},
+                    "units": _units_at(experiment.units, kind, value),
+                    "sweep": None,
+                    "measure": _measured(experiment),
+                }
+            )
+            if at.configurations:
+                yield Point(kind, float(value), at)
+
+
+def _measured(experiment: Experiment) -> Measure:
+    """Perceived conflicts take time, and are not asked for unless somebody brakes for them."""
+    needed = experiment.braking is not None and experiment.braking.brakes_for == "conflict"
+    return experiment.measure if needed else experiment.measure.model_copy(update={"conflict": None})
+
+
+def _curves(
+    experiment: Experiment, kind: str, values: tuple[float, ...]
+) -> dict[str, tuple[Configuration | None, ...]]:
+    """What becomes of each configuration at each value; None: it has no such value."""
+    curves: dict[str, tuple[Configuration | None, ...]] = {}
+    assert experiment.sweep is not None
+    wanted = experiment.sweep.configurations or tuple(experiment.configurations)
+    for name, configuration in experiment.configurations.items():
+        if name not in wanted or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
+            continue
+        curve = tuple(_configuration_at(experiment, configuration, kind, value) for value in values)
+        if curve not in curves.values():
+            curves[name] = curve
+    return curves
+
+
+def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -> bool:
+    units = [experiment.units[name] for name in experiment.units_of(configuration)]
+    if kind == "units":
+        return any(not _is_ego(unit) for unit in units)
+    return kind != "share" or any(isinstance(unit.on, Carriers) for unit in units)
+
+
+def _is_ego(unit: Unit) -> bool:
+    return unit.on == "ego"
+
+
+def _configuration_at(
+    experiment: Experiment, configuration: Configuration, kind: str, value: float
+) -> Configuration | None:
+    if kind == "latency_s":
+        by_unit = configuration.latency_s
+        late = by_unit | {"default": value} if isinstance(by_unit, dict) else value
+        return configuration.model_copy(update={"latency_s": late})
+    if kind != "units":
+        return configuration
+    heard = experiment.units_of(configuration)
+    others = [name for name in heard if not _is_ego(experiment.units[name])]
+    kept = [name for name in heard if name not in others[int(value) :]]
+    if value > len(others) or not kept:
+        return None
+    return configuration.model_copy(update={"units": tuple(kept)})
+
+
+def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
+    if kind == "rate_hz":
+        return {name: unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()}
+    if kind == "share":
+        return {
+            name: unit.model_copy(update={"on": unit.on.model_copy(update={"share": value})})
+            if isinstance(unit.on, Carriers)
+            else unit
+            for name, unit in units.items()
+        }
+    return dict(units)
