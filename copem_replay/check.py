@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from copem_replay.errors import RecordingError
-from copem_replay.experiment import LONGEST_CHAIN, Experiment
+from copem_replay.experiment import LONGEST_CHAIN, Carriers, Experiment
 from copem_replay.experiment_file import Source, is_there, log_paths, parse
 from copem_replay.plain_yaml import Key
 from copem_replay.read import Recording, moving_ids, read
@@ -108,7 +108,7 @@ def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
     """What units that only some runs have do not go with."""
     measure = data.get("measure")
     measure = measure if isinstance(measure, dict) else {}
-    of = measure["confirm"].get("of", 1) if isinstance(measure.get("confirm"), dict) else 1
+    hits = measure["confirm"].get("hits", 1) if isinstance(measure.get("confirm"), dict) else 1
     for name, unit in _items(data.get("units")):
         if not isinstance(unit.get("on"), dict):
             continue
@@ -116,17 +116,11 @@ def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
             yield source.at(
                 ("measure", "distance_to"), f"unit {name!r} is carried by several objects; name a single one"
             )
-        if isinstance(of, int) and of > 1 and unit.get("rate_hz") is not None:
-            yield source.at(
-                ("units", name, "rate_hz"),
-                "a unit that only some runs have confirms over several captures only with the frames of the truth; "
-                "leave rate_hz out, or confirm with one of one",
-            )
-        if isinstance(of, int) and of > 1 and measure.get("exact") is True:
+        if isinstance(hits, int) and hits > 1 and measure.get("exact") is True:
             yield source.at(
                 ("measure", "exact"),
-                f"exact: unit {name!r} is only in some runs, and confirmation over several captures then has no "
-                "closed form; confirm with one of one",
+                f"exact: unit {name!r} is only in some runs, and confirmation by several hits then has no closed "
+                "form; confirm with one hit",
             )
 
 
@@ -273,7 +267,11 @@ def against_log(
         if unit.on == "ego":
             if not studied:
                 yield ("units", name, "on"), "no ego in this study to carry the unit"
-        elif isinstance(unit.on, str) and unit.on not in scene.object_number:
+        elif isinstance(unit.on, Carriers):
+            taken = [one for one in scene.object_ids if f"{name}:{one}" in experiment.units]
+            if taken:
+                yield ("units", f"{name}:{taken[0]}"), f"that is what {name} is called on object {taken[0]}"
+        elif unit.on is not None and unit.on not in scene.object_number:
             yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
     if experiment.measure.onset.kind != "line_of_sight" or known:
         return

@@ -118,6 +118,29 @@ def run(
 
 
 @app.command()
+def plot(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder.")],
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Where the figures go [DIR/figures].")] = None,
+    configurations: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Only these; in the figure of runs four of them by default.")
+    ] = None,
+    run: Annotated[int | None, typer.Option(metavar="N", help="Run that is shown [as in replay.rrd].")] = None,
+    object: Annotated[
+        str | None, typer.Option(metavar="ID", help="Object whose runs are shown [the first in conflict].")
+    ] = None,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log of the runs shown [the first].")] = None,
+) -> int:
+    """Figures from a results folder, as PNG and SVG: single runs, distances, curves, and sweeps if there are some."""
+    from copem_replay.plot import load_results, write_figures
+
+    names = None if configurations is None else [name.strip() for name in configurations.split(",")]
+    files, notes = write_figures(load_results(folder), out, configurations=names, log=log, object_id=object, run=run)
+    _complain(f"note: {note}" for note in notes)
+    _print_blocks([[str(file) for file in files]])
+    return 0
+
+
+@app.command()
 def view(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder.")]) -> int:
     """Open the recordings of a results folder in the Rerun viewer."""
     import subprocess

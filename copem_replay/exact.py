@@ -8,7 +8,7 @@ refused. With the reaction's distribution follows the probability to pass. docs/
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,11 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
     Raises ExperimentError for a configuration that has no closed form.
     """
     braking = experiment.braking
+    if braking is not None and braking.brakes_for == "conflict":
+        raise ExperimentError(
+            f"{replay.scene.log}: measure.exact: perceived conflicts depend on sampled errors, and `brakes_for: "
+            "conflict` has no closed form; use `brakes_for: object`, or leave `exact` out"
+        )
     parts = []
     for name in experiment.configurations:
         columns = _columns(replay, experiment, name, distributions(replay, experiment, name))
@@ -41,6 +46,16 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
             columns |= _passing(replay, columns, braking.driver.reaction)
         parts.append(pd.DataFrame(columns).drop(columns="look"))
     return pd.concat(parts, ignore_index=True)
+
+
+def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
+    """Raises ExperimentError for a configuration that has no closed form."""
+    if not experiment.measure.exact or experiment.measure.confirm.hits == 1:
+        return
+    for replay in ready:
+        units = fleet_of(experiment, replay.scene).experiment
+        for name, configuration in units.configurations.items():
+            _shared_instants(replay, listen(replay.measured.tracks, replay.truth, units, configuration), name)
 
 
 def distributions(replay: Replay, experiment: Experiment, name: str) -> list[tuple[Float, Float]]:
@@ -130,8 +145,13 @@ def _confirmed(instant: Int, arrives_s: Float, listed: Float, hits: int, of: int
 
 def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
     """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
-    instants = capture_instants(heard)
     came = np.isfinite(heard.arrives_s[0])
+    if heard.units != (TRUTH,) and (replay.fleet.share[heard.frame_unit_ix[came]] < 1).any():
+        raise ExperimentError(
+            f"{replay.scene.log}: measure.exact: configuration {name}: some units are only in some runs, and "
+            "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
+        )
+    instants = capture_instants(heard)
     everyone = np.unique(instants[came])
     for unit in np.unique(heard.frame_unit_ix[came]):
         mine = came & (heard.frame_unit_ix == unit)

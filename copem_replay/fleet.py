@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.chance import Address, Dice, object_words
+from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Carriers, Configuration, Experiment, Unit
 from copem_replay.tracks import Bool, Float, Int, Scene, class_indices
 
@@ -40,7 +41,10 @@ class Fleet:
 
 
 def fleet_of(experiment: Experiment, scene: Scene) -> Fleet:
-    """An experiment's units over one log, one for every object that may carry one."""
+    """An experiment's units over one log, one for every object that may carry one.
+
+    Raises ExperimentError where another unit has such a name.
+    """
     units: dict[str, Unit] = {}
     named: list[str] = []
     carriers: list[str] = []
@@ -55,6 +59,10 @@ def fleet_of(experiment: Experiment, scene: Scene) -> Fleet:
             if k == scene.ego_ix:
                 continue
             one = scene.object_ids[k]
+            if f"{name}:{one}" in experiment.units:
+                raise ExperimentError(
+                    f"units: {name}:{one} is what {name} is called on object {one}; choose another name"
+                )
             units[f"{name}:{one}"] = unit.model_copy(update={"on": one})
             named, carriers, share = [*named, name], [*carriers, one], [*share, unit.on.share]
     if all(name in units for name in experiment.units):

@@ -61,7 +61,8 @@ def corridors(ego: EgoCourse, now_s: Float, wanted: Conflict) -> tuple[Float, In
     """
     course = ego.course(now_s)
     ahead_m = np.where(np.isnan(course.along_m), np.nan, course.speed_mps * wanted.horizon_s)
-    count = np.where(np.isnan(ahead_m), 0, np.clip(np.ceil(np.nan_to_num(ahead_m) / _PIECE_M), 1, _PIECES)).astype(np.int64)
+    pieces_of = np.clip(np.ceil(np.nan_to_num(ahead_m) / _PIECE_M), 1, _PIECES)
+    count = np.where(np.isnan(ahead_m), 0, pieces_of).astype(np.int64)
     bounds = np.concatenate([[0], np.cumsum(count)])
     pieces = np.empty((bounds[-1], 5))
     size = ego.size_m + 2 * wanted.margin_m

@@ -17,6 +17,7 @@ from copem_replay.braking.encounter import Encounter, encounters
 from copem_replay.braking.verdict import passing
 from copem_replay.candidates import Candidates, candidates
 from copem_replay.detect import detect
+from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Configuration, Experiment
 from copem_replay.fleet import Fleet, fleet_of
 from copem_replay.foresee import foreseen
@@ -27,7 +28,7 @@ from copem_replay.onset import Looks, looks
 from copem_replay.perceive import perceive
 from copem_replay.read import Recording
 from copem_replay.resample import at_instants
-from copem_replay.tracks import TRUTH, Float, Int, Scene, Tracks
+from copem_replay.tracks import TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.transmit import transmit
 
 ROWS_TIMES_RUNS = 50_000_000
@@ -61,13 +62,20 @@ class Replay:
         return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
 
 
-def prepare(recording: Recording, experiment: Experiment) -> Replay:
-    """Everything about a log that all runs and configurations share."""
+def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
+    """Everything about a log that all runs and configurations share. Raises ExperimentError where an ego is missing.
+
+    `onsets_of`: whose onsets they are, where units of the experiment are only in this run (`fleet.of_run`).
+    """
     scene = recording.scene
+    if scene.ego_ix < 0:
+        for key, asked in (("braking", experiment.braking), ("measure.conflict", experiment.measure.conflict)):
+            if asked is not None:
+                raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
     fleet = fleet_of(experiment, scene)
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     found = candidates(scene, truth, fleet.experiment)
-    on = looks(scene, truth, found.static, experiment)
+    on = looks(scene, truth, found.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)
     return Replay(scene, fleet, truth, found, found.of_objects(on.object_ix), on, meeting)
 
@@ -85,12 +93,24 @@ def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
 
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
     """The rows of `detections.parquet` of one block of runs (S,)."""
-    experiment = fleet_of(experiment, replay.scene).experiment
     equipped = replay.fleet.equipped(replay.scene.log, runs)
+    if equipped is None or (experiment.measure.confirm.of == 1 and experiment.measure.conflict is None):
+        return _block(replay, experiment, runs, equipped, None)
+    # Which lists there are decides what is consecutive: runs with the same units go together.
+    patterns, which = np.unique(equipped, axis=0, return_inverse=True)
+    parts = [_block(replay, experiment, runs[which == k], None, there) for k, there in enumerate(patterns)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _block(
+    replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None
+) -> pd.DataFrame:
+    """Rows of runs (S,): `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
+    experiment = fleet_of(experiment, replay.scene).experiment
     seen = perceive(replay.scene, replay.measured, experiment, runs, states="true", equipped=equipped)
     results: dict[str, Events] = {}
     for name, configuration in experiment.configurations.items():
-        heard = listen(seen, replay.truth, experiment, configuration)
+        heard = listen(seen, replay.truth, experiment, configuration, there)
         result = detect(
             heard,
             replay.looks,
@@ -100,7 +120,7 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
         )
         results[name] = Events(heard.units, result)
     if experiment.measure.conflict is not None:
-        for name, belief in _beliefs(replay, replay.measured, experiment, runs):
+        for name, belief in _beliefs(replay, replay.measured, experiment, runs, there):
             results[name] = replace(results[name], foreseen_s=_foreseen(replay, belief, experiment))
     return table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, results)
 
@@ -119,34 +139,42 @@ def _foreseen(replay: Replay, belief: Belief, experiment: Experiment) -> Float:
     )
 
 
-def listen(seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration) -> Tracks:
+def listen(
+    seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration, there: Bool | None = None
+) -> Tracks:
     """What reaches the receiver in one configuration: the lists of its units, late; those of the others never.
 
-    Nothing is copied: configurations share the rows, and what was drawn for them.
+    `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn
+    for them.
     """
     if configuration.units == TRUTH:
         return transmit(truth, configuration.latency_of)
-    heard = experiment.units_of(configuration)
+    heard = set(experiment.units_of(configuration))
+    if there is not None:
+        heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
     return transmit(seen, lambda unit: configuration.latency_of(unit) if unit in heard else np.inf)
 
 
 def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
     """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
-    return dict(_beliefs(replay, replay.found, experiment, np.array([run])))
-
-
-def _beliefs(replay: Replay, found: Candidates, experiment: Experiment, runs: Int) -> Iterator[tuple[str, Belief]]:
-    """Fused lists in the runs (S,), made of the rows of `found`."""
-    ego = replay.scene.ego_ix
-    experiment = fleet_of(experiment, replay.scene).experiment
+    runs = np.array([run])
     equipped = replay.fleet.equipped(replay.scene.log, runs)
+    experiment = fleet_of(experiment, replay.scene).experiment
+    return dict(_beliefs(replay, replay.found, experiment, runs, None if equipped is None else equipped[0]))
+
+
+def _beliefs(
+    replay: Replay, found: Candidates, experiment: Experiment, runs: Int, there: Bool | None
+) -> Iterator[tuple[str, Belief]]:
+    """Fused lists in the runs (S,), made of the rows of `found`, by the units that are `there (U,)`."""
+    ego = replay.scene.ego_ix
     seen: dict[bool, Tracks] = {}  # by whether the states are the expected ones; each is made when first needed
     for name, configuration in experiment.configurations.items():
         posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
         if posterior not in seen:
             states: Literal["expected", "sampled"] = "expected" if posterior else "sampled"
-            seen[posterior] = perceive(replay.scene, found, experiment, runs, states=states, equipped=equipped)
-        heard = listen(seen[posterior], replay.truth, experiment, configuration)
+            seen[posterior] = perceive(replay.scene, found, experiment, runs, states=states)
+        heard = listen(seen[posterior], replay.truth, experiment, configuration, there)
         belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
         if configuration.units != TRUTH:
             belief = replace(belief, look=found.look)

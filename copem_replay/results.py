@@ -128,7 +128,8 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     replay = next(r for r in result.replays if r.scene.log == log)
     alone = of_run(experiment, replay.scene, number)
     if alone is not experiment:  # with the units that this run has
-        replay = prepare(next(r for r in recordings if r.scene.log == log), alone)
+        recording = next(r for r in recordings if r.scene.log == log)
+        replay = prepare(recording, alone, onsets_of=experiment)
     beliefs = believed(replay, alone, number)
     rows = result.table[(result.table["log"] == log) & (result.table["run"] == number)]
     manifest = {

@@ -11,13 +11,13 @@ import numpy as np
 import pandas as pd
 
 from copem_replay import replay as replays
-from copem_replay.exact import exact_table
-from copem_replay.experiment import At, Experiment
+from copem_replay.exact import check_exact, exact_table
+from copem_replay.experiment import At, Carriers, Experiment
 from copem_replay.onset import measured_objects
 from copem_replay.read import Recording
 from copem_replay.replay import Replay
 from copem_replay.summary import horizon_s, summary
-from copem_replay.sweep import Point, points
+from copem_replay.sweep import Point, points, without_points
 from copem_replay.tracks import CLASSES, TRUTH
 
 Progress = Callable[[int, int], None]
@@ -44,6 +44,9 @@ def run(
     ready = [replays.prepare(recording, experiment) for recording in recordings]
     # Before the runs: what has no closed form is refused at once.
     exact = _exactly(ready, experiment)
+    for point in points(experiment):
+        if point.same_units:
+            check_exact(ready, point.experiment)
     tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)))
     table = tables.of(ready, experiment)
     horizon = horizon_s(table, experiment.measure.horizon_s)
@@ -58,6 +61,7 @@ def run(
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
     notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
+    notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, sweep)
 
@@ -67,7 +71,7 @@ def _at_point(
 ) -> pd.DataFrame:
     """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
     experiment = point.experiment
-    if point.sweep in ("rate_hz", "share"):
+    if not point.same_units:
         ready = [replays.prepare(recording, experiment) for recording in recordings]
     rows, _ = summary(
         tables.of(ready, experiment),
@@ -140,6 +144,9 @@ def _notes(replay: Replay, experiment: Experiment) -> list[str]:
         notes.append(f"no rows: the onset at {measure.onset.time_s:g} s lies after the log's end, {scene.end_s:g} s")
     elif not len(replay.looks.object_ix):
         notes.append(f"no rows: no measured object has an onset ({measure.onset.kind})")
+    for name, unit in experiment.units.items():
+        if isinstance(unit.on, Carriers) and name not in replay.fleet.named:
+            notes.append(f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})")
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
         late = [unit for unit in units if configuration.latency_of(unit) > scene.end_s]

@@ -48,7 +48,7 @@ def cumulative_incidence(
     `ending (n,)`: `DETECTED`, `LEFT` or `CENSORED`. Of equal times, detections and departures come before
     censorings: who is censored at t was looked at until t, t included.
     `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: what
-    share of all weight is still somebody to whom the weight of the censored goes.
+    share of all weight is still somebody, to whom the weight of the censored goes.
 
     Returns `times_s (M,)`, the distinct times of detection, ascending, and `incidence (M,)`, the value from
     each of them (included) to the next. Before the first it is 0, after the last it stays. Both are empty
@@ -81,7 +81,7 @@ def cumulative_incidence(
         raise ValueError("cumulative_incidence: expected a weight above 0")
     remaining = total - until[np.searchsorted(time_s[order], lost_s, side="right")]
     # Where nobody remains, nobody takes the weight over.
-    there = remaining > least * total
+    there = remaining >= least * total * (1 - 1e-9)
     factors = 1.0 + lost[there] / remaining[there]
     weights = np.append(1.0, np.cumprod(factors))
     handed = weights[np.minimum(np.searchsorted(lost_s, times_s, side="left"), len(factors))]

@@ -23,6 +23,11 @@ class Point:
     value: float
     experiment: Experiment
 
+    @property
+    def same_units(self) -> bool:
+        """Whether what is prepared for the experiment serves this point, too."""
+        return self.sweep in ("latency_s", "units")
+
 
 def points(experiment: Experiment) -> Iterator[Point]:
     """The points of all sweeps of an experiment, sweep by sweep in the order of their values."""
@@ -42,6 +47,14 @@ def points(experiment: Experiment) -> Iterator[Point]:
             )
             if at.configurations:
                 yield Point(kind, float(value), at)
+
+
+def without_points(experiment: Experiment) -> list[str]:
+    """Sweeps of an experiment that no configuration is changed by."""
+    if experiment.sweep is None:
+        return []
+    there = {point.sweep for point in points(experiment)}
+    return [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in there]
 
 
 def _measured(experiment: Experiment) -> Measure:
@@ -70,6 +83,8 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
     units = [experiment.units[name] for name in experiment.units_of(configuration)]
     if kind == "units":
         return any(not _is_ego(unit) for unit in units)
+    if kind == "latency_s" and isinstance(configuration.latency_s, dict):
+        return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
     return kind != "share" or any(isinstance(unit.on, Carriers) for unit in units)
 
 

@@ -38,7 +38,7 @@ from experiments import changed, source_of
 from recordings import Obj, pedestrian, write_recording
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
-SOME = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+SOME = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 COLUMNS = [
     "conflict_detected",
     "conflict_detection_s",
@@ -670,6 +670,29 @@ class TestRecordedEgo:
         log = with_columns(log, "ego", vx_mps=lambda t: 0 * t + 0.02, vy_mps=lambda t: 0 * t)
         assert math.isnan(event(log, plan()))
 
+    def test_a_halt_with_a_jitter_is_no_way(self) -> None:
+        """10 m on it halts for two seconds, its place jittering by 6 cm. Before that its corridor reaches 10 t + 32.5 m
+        all the same: a pedestrian 35 m ahead (less half of himself) is in it from 0.25 s on."""
+
+        def halts(t: float) -> tuple[float, float]:
+            if 1 <= t < 3:
+                return 10.0, 0.06 * (round(t * 10) % 2)
+            return 10 * min(t, 1) + 10 * max(t - 3, 0.0), 0.0
+
+        ego, walker = Thing("ego", "car", halts), Thing("walker", "pedestrian", standing(35.25, 0))
+        assert event(recording([ego, walker], until_s=4.0), plan()) == pytest.approx(0.3)
+
+    def test_on_a_slant(self) -> None:
+        """It drives 10 m/s ahead and 2 m/s to the left, heading straight ahead: all it sweeps is in its corridor."""
+        log = recording([Thing("ego", "car", driving(0, 0, 10, 2))], until_s=4.0)
+        ready = prepare(log, plan())
+        pieces, _ = corridors(EgoCourse(ready.scene, ready.truth, 0.5), np.array([0.5]), Conflict())
+        found = shapely.union_all(boxes(*pieces.T))
+        swept_there = shapely.union_all(corridor_of(log, 0.5, 3.0).boxes(0.5 - 1e-6))
+        assert shapely.difference(swept_there, found).area < 1e-9
+        # Straight pieces of 2 m, heading ahead, stick out by less than 0.4 m.
+        assert shapely.difference(found, shapely.buffer(swept_there, 0.4)).area < 1e-9
+
     def test_stopping_with_a_jitter(self) -> None:
         """It stops after 10 m; long after, its recorded place moves 2 µm to the left. "Straight on" is still ahead: who
         stands 12 m to the left of where it stops is in nobody's way, who stands 15 m ahead of there is."""
@@ -701,6 +724,31 @@ class TestRecordedEgo:
         found = rows(recording(things, until_s=4.0), plan())["conflict_detection_s"]
         assert math.isnan(found["GT", 0, "beside"])
         assert found["GT", 0, "front"] == 0.0
+
+    def test_reversing(self) -> None:
+        """It reverses at 2 m/s, heading east: its way is behind it, 2.5 + 6 m, also where the recording ends."""
+        things = [
+            Thing("ego", "car", driving(0, 0, -2)),
+            Thing("behind", "pedestrian", standing(-11.05, 0)),
+            Thing("ahead", "pedestrian", standing(2.8, 0)),
+        ]
+        found = rows(recording(things, until_s=2.0), plan())["conflict_detection_s"]
+        assert found["GT", 0, "behind"] == pytest.approx(1.2), "10.8 ≤ 2 t + 8.5"
+        assert math.isnan(found["GT", 0, "ahead"])
+
+    def test_creeping(self) -> None:
+        """1 cm from frame to frame, 0.1 m/s: 2.5 + 0.3 m ahead and 0.1 m/s on, wherever the places of its path are."""
+        walker = Thing("walker", "pedestrian", standing(3.205, 0))
+        log = recording([Thing("ego", "car", driving(0, 0, 0.1)), walker], until_s=4.0)
+        assert event(log, plan()) == pytest.approx(1.6), "2.955 ≤ 0.1 t + 2.8 from 1.55 s on"
+
+    def test_one_frame(self) -> None:
+        """It is in a single frame, at 10 m and 10 m/s: that is enough to know where it is heading."""
+        ego = Thing("ego", "car", driving(0, 0, 10), lambda t: 0.95 < t < 1.05)
+        things = [ego, *(Thing(f"at {x}", "pedestrian", standing(x, 0)) for x in (42, 43))]
+        found = rows(recording(things, until_s=2.0), plan())["conflict_detection_s"]
+        assert found["GT", 0, "at 42"] == pytest.approx(1.0), "41.75 ≤ 10 + 32.5"
+        assert math.isnan(found["GT", 0, "at 43"])
 
     def test_horizon_beyond_all_logs(self) -> None:
         """A slip of seconds for milliseconds is answered, not run out of memory on."""
@@ -893,6 +941,18 @@ class TestErrors:
             assert (event_s > 1.35).any()
             assert (event_s >= found.loc[name, "detection_s"] - 1e-9).all()
 
+    @pytest.mark.parametrize("combine", ["samples", "posterior"])
+    def test_how_often_at_once(self, combine: str) -> None:
+        """He stands one standard deviation, 1 m, beside the corridor: 15.87 % of the first lists imply a conflict."""
+        walker = Thing("walker", "pedestrian", standing(15, -2.75))
+        log = recording([Thing("ego", "car", driving(0, 0, 10)), walker], until_s=0.5)
+        error = {"kind": "gaussian", "covariance_m2": [[1.0, 0.0], [0.0, 1.0]]}
+        one = {"one": [{"detection": {"kind": "constant", "probability": 1.0}, "error": error}]}
+        configurations = {"PEM": {"units": ["ego"], "fusion": {"kind": "ideal", "combine": combine}}}
+        wanted = plan(pems=one, units=wanted_units("one"), configurations=configurations, runs=2000)
+        at_once = (rows(log, wanted)["conflict_detection_s"] < 1e-9).mean()
+        assert 0.126 < at_once < 0.192, "4 standard deviations of a share of 2000"
+
     def test_a_wrong_speed_is_believed(self) -> None:
         """Speed errors of a standing pedestrian go along his heading: north, towards the lane. Without them, never."""
         walker = Thing("walker", "pedestrian", standing(20, -4), yaw_rad=math.pi / 2)
@@ -1001,6 +1061,23 @@ class TestRuns:
         plain = run(without, [self.LOG]).table
         assert not set(COLUMNS) & set(plain.columns)
         pd.testing.assert_frame_equal(run(self.WANTED, [self.LOG]).table[plain.columns], plain, check_exact=True)
+
+    def test_summary(self) -> None:
+        """Implied at 1.3 s, 32.3 m away, and at 2.3 s, 22.5 m away, and never."""
+        things = [
+            Thing("ego", "car", driving(0, 0, 10)),
+            Thing("first", "pedestrian", driving(45, -6, 0, 1)),
+            Thing("second", "pedestrian", driving(45, -7, 0, 1)),
+            Thing("third", "pedestrian", standing(45, -7)),
+        ]
+        result = run(plan(measure={"horizon_s": 2.8}), [recording(things, until_s=3.0)])
+        found = result.summary.set_index("configuration").loc["GT"]
+        assert found["detected_share"] == 1
+        assert found["conflict_detected_share"] == pytest.approx(2 / 3)
+        assert found["conflict_ttd_median_s"] == pytest.approx(2.3)
+        assert pd.isna(found["conflict_ttd_p95_s"])
+        assert found["conflict_ttd_rmst_s"] == pytest.approx((1.3 + 2.3 + 2.8) / 3)
+        assert found["conflict_dad_median_m"] == pytest.approx(math.hypot(22.0, 4.7))
 
     def test_nothing_is_looked_at(self) -> None:
         wanted = plan(

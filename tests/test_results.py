@@ -42,7 +42,8 @@ COLUMNS = {
 }
 SUMMARY = [
     "configuration", "n", "list_rate_hz", "detected_share", "detected_share_low", "detected_share_high", "interval",
-    "interval_over", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m", "dad_p5_m",
+    "interval_over", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
+    "dad_p5_m",
 ]  # fmt: skip
 
 

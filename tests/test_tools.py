@@ -8,14 +8,24 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.stats import binom
+
+from copem_replay.check import problems, read_logs
+from copem_replay.experiment_file import load
+from copem_replay.run import run
+from copem_replay.statistics import wilson
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
 sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
+import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
+import make_logs  # noqa: E402
+import paper  # noqa: E402
 
 
 def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
@@ -76,3 +86,56 @@ def test_the_benchmarks_plain_loop_reads_what_the_reader_reads(tmp_path: Path) -
     recording = read(tmp_path / "b.mcap", name="b")
     assert bench._plain_loop(tmp_path / "b.mcap") == len(recording.truth.frame_ix) == 35
     assert recording.truth.x_m[0] == pytest.approx(world.x_m[0])
+
+
+def test_paper_counts_and_what_stands_beside_them() -> None:
+    """The six counts of the paper's table, and its intervals as in the published rates (Wilson, four digits)."""
+    assert paper.PASSED == {"GT": 500, "PEM": 426, "coPEM:0s": 499, "coPEM:0.5s": 474, "coPEM:1s": 323, "coPEM:1.5s": 0}
+    ours = pd.DataFrame({"configuration": list(paper.PASSED), "pass_share": 0.5, "pass_share_exact": 0.86})
+    table = paper.beside(ours)
+    assert table["paper"].tolist() == pytest.approx([1.0, 0.852, 0.998, 0.948, 0.646, 0.0])
+    assert table["paper 95 %"].tolist() == [
+        "[0.9924, 1.0000]", "[0.8182, 0.8804]", "[0.9888, 0.9996]", "[0.9249, 0.9643]", "[0.6031, 0.6867]",
+        "[0.0000, 0.0076]",
+    ]  # fmt: skip
+    assert table["exact within"].tolist() == ["no", "yes", "no", "no", "no", "no"]
+
+
+def test_misfit_by_hand() -> None:
+    """None at the paper's own rates; at .5 everywhere 2 n log 2 for each of the three with all or none."""
+    rates = {name: passed / paper.RUNS for name, passed in paper.PASSED.items()}
+    assert calibrate_tc016d.misfit(rates) == pytest.approx(0.0, abs=1e-6)
+    halved = calibrate_tc016d.misfit(rates | {"GT": 0.5, "coPEM:1.5s": 0.5})
+    assert halved == pytest.approx(2 * 2 * 500 * np.log(2))
+
+
+@pytest.mark.long
+def test_calibration_is_what_the_page_says_and_the_experiment_has() -> None:
+    """The fit again: the same page; its parameters are those of the experiment and of the recording."""
+    page = calibrate_tc016d.page()
+    assert page == (ROOT / "docs/calibration.md").read_text(encoding="utf-8")
+    experiment, _ = problems(load(ROOT / "logs/tc016d.yaml"))
+    assert experiment is not None
+    assert experiment.braking is not None
+    driver = experiment.braking.driver.model_dump()
+    assert f"| `a_max_mps2`, full braking | {driver['a_max_mps2']:g} m/s² |" in page
+    assert f"shape of the gamma distribution | {driver['reaction']['shape']:g} |" in page
+    assert f"| reaction, mean | {driver['reaction']['mean_s']:g} s |" in page
+    assert f"| road side of the truck | y = {make_logs.TC016D_TRUCK_EDGE_M:g} m |" in page
+
+
+def test_the_table_is_the_papers() -> None:
+    """Each exact rate within the paper's Wilson interval, in its order; the sample within 99 % of its own."""
+    experiment, _ = problems(load(ROOT / "logs/tc016d.yaml"))
+    assert experiment is not None
+    assert (experiment.runs, experiment.seed) == (500, 1)
+    recordings, _ = read_logs(experiment, [ROOT / "logs/tc016d.mcap"], None)
+    rows = run(experiment, recordings).summary.set_index("configuration")
+    exact = rows["pass_share_exact"]
+    for name, passed in paper.PASSED.items():
+        low, high = wilson(passed, paper.RUNS)
+        assert low <= exact[name] <= high, name
+        at_least, at_most = binom.interval(0.99, 500, exact[name]) if exact[name] > 0 else (0, 0)
+        assert at_least <= rows["pass_share"][name] * 500 <= at_most, name
+    order = ["GT", "coPEM:0s", "coPEM:0.5s", "PEM", "coPEM:1s", "coPEM:1.5s"]
+    assert (np.diff([exact[name] for name in order]) <= 1e-12).all()

@@ -15,8 +15,6 @@ _TOUCH_M = 1e-9
 """Boxes this near touch (chosen: rounding of positions within a few kilometres of the origin)."""
 _FINE_M = 1e-6
 """A distance that could be smaller by no more than this is not looked into (chosen)."""
-_STRIDE_M = 1e-3
-"""The shortest step along a path in search of a contact (chosen: a graze shorter than this may be missed)."""
 
 
 @nb.njit(cache=True, inline="always")
@@ -68,7 +66,7 @@ def pose_on(path: Float, s: float) -> tuple[float, float, float]:
 @nb.njit(cache=True, inline="always")
 def _between(values: Float, at: float) -> float:
     """Value at a place between the instants, counted in them: 2.5 is half way from 2 to 3."""
-    k = min(int(at), len(values) - 2) if len(values) > 1 else 0
+    k = int(at)
     f = at - k
     return float(values[k]) if f == 0 else float(values[k] + f * (values[k + 1] - values[k]))
 
@@ -213,72 +211,3 @@ def _lowest(
             v = a + g * (b - a)
             dv = _distance_at(along, path, size, other, other_size, v)
     return (u, du) if du <= dv else (v, dv)
-
-
-@nb.njit(cache=True, nogil=True)
-def reach(
-    path: Float, size: Float, other: Float, other_size: Float, margin_m: float, from_m: float, to_m: Float, out: Float
-) -> None:
-    """How far along its path the ego can go, instant by instant, before it is within the margin of the other: (T,).
-
-    From `from_m` on, at most to `to_m (T,)`; inf where it is never within the margin up to there. The ego advances by
-    as much as surely stays clear until nothing is left of it (sphere tracing).
-    """
-    most = turning(path, size)
-    for k in range(other.shape[1]):
-        out[k] = np.inf
-        if np.isnan(other[0, k]):
-            continue
-        clear, s = from_m, from_m
-        while s <= to_m[k]:
-            x, y, yaw = pose_on(path, s)
-            free = (
-                box_distance(
-                    x, y, yaw, size[0], size[1], other[0, k], other[1, k], other[2, k], other_size[0], other_size[1]
-                )
-                - margin_m
-            )
-            if free <= 0.0:
-                out[k] = _last_clear(path, size, other[:, k], other_size, margin_m, clear, s)
-                break
-            clear = s
-            s += max(free / most, _STRIDE_M)
-
-
-@nb.njit(cache=True)
-def _last_clear(
-    path: Float, size: Float, other: Float, other_size: Float, margin_m: float, clear: float, within: float
-) -> float:
-    """Where between two places of the path, the second within the margin, the ego comes within it: by halves."""
-    for _ in range(40):
-        s = (clear + within) / 2
-        x, y, yaw = pose_on(path, s)
-        if (
-            box_distance(x, y, yaw, size[0], size[1], other[0], other[1], other[2], other_size[0], other_size[1])
-            > margin_m
-        ):
-            clear = s
-        else:
-            within = s
-    return within
-
-
-@nb.njit(cache=True, nogil=True)
-def required(time_s: Float, reach_m: Float, begin_s: Float, begin_m: Float, speed_mps: Float, out: Float) -> None:
-    """Smallest constant deceleration (R,) that stays short of `reach_m (T,)` from `begin_s (R,)` on; inf: none does.
-
-    At `begin_s` the ego is at `begin_m (R,)` with `speed_mps (R,)`. To be no farther than g after t: none where
-    v·t ≤ g; 2 (v·t − g) / t² where it then still moves; v² / 2 g where it has to stop before.
-    """
-    for r in range(len(out)):
-        a = 0.0
-        v = speed_mps[r]
-        for k in range(int(np.searchsorted(time_s, begin_s[r])), len(time_s)):
-            t, g = time_s[k] - begin_s[r], reach_m[k] - begin_m[r]
-            if v * t <= g and g > 0:
-                continue
-            if g <= 0:
-                a = np.inf
-                break
-            a = max(a, 2 * (v * t - g) / (t * t) if v * t / 2 <= g else v * v / (2 * g))
-        out[r] = a

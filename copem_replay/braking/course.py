@@ -24,12 +24,14 @@ class Course:
     """The ego that does not brake, at T instants.
 
     `along_m (T,)` its way from the first vertex of the path, NaN where it is not in the log; `bound_m (T,)` the same
-    with gaps closed, and past its last frame inf: farther than that it never is; `speed_mps (T,)`.
+    with gaps closed, going on past its last frame, `until_s`, as fast as there: farther than that it never is;
+    `speed_mps (T,)`.
     """
 
     along_m: Float
     bound_m: Float
     speed_mps: Float
+    until_s: float
 
 
 class EgoCourse:
@@ -55,13 +57,13 @@ class EgoCourse:
         if constant_from_s is not None:
             start_m, speed = (np.interp(constant_from_s, self.frame_s, v) for v in (self.frame_m, self.frame_mps))
             along = start_m + speed * (time_s - constant_from_s)
-            return Course(along, along, np.full(len(time_s), speed))
-        last_s = self.frame_s[-1]
-        time_s = np.where((time_s > last_s) & (time_s <= last_s + _TOLERANCE_S), last_s, time_s)
-        bound = np.interp(time_s, self.frame_s, self.frame_m, right=np.inf)
+            return Course(along, along, np.full(len(time_s), speed), np.inf)
+        last_s = float(self.frame_s[-1])
+        bound = np.interp(time_s, self.frame_s, self.frame_m)
+        bound += self.frame_mps[-1] * np.maximum(time_s - last_s, 0.0)
         _, present = self.states(self._scene.ego_ix, time_s)
-        along = np.where(present & np.isfinite(bound), bound, np.nan)
-        return Course(along, bound, np.interp(time_s, self.frame_s, self.frame_mps))
+        speed = np.interp(time_s, self.frame_s, self.frame_mps)
+        return Course(np.where(present, bound, np.nan), bound, speed, last_s + _TOLERANCE_S)
 
     def states(self, object_ix: int, time_s: Float) -> tuple[dict[str, Float], Bool]:
         """States of any object at instants (T,), and whether it is in the log then."""

@@ -1,4 +1,4 @@
-"""Driver models: what the ego does once an object is known. They say delays and ways, and never draw.
+"""Driver models: what the ego does once an object is known. They say how late and how hard, and never draw.
 
 A driver reacts after a delay and then brakes along its path; it does not steer. It is declared, not observed: a verdict
 is that of the declared driver.
@@ -74,39 +74,31 @@ REACTIONS = {
 
 
 class Driver(Component, ABC):
-    """Base of driver models: how long it takes to react, and how far the ego still drives once it brakes."""
+    """Base of driver models: how long it takes to react, and how hard it then brakes."""
 
     reaction: Annotated[Reaction, Slot("reaction", REACTIONS)] = ConstantReaction()
 
     @abstractmethod
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        """(R, T) metres driven `elapsed_s (R, T)` ≥ 0 after braking began at `speed_mps (R, 1)`; never decreasing."""
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        """(R, T) how hard it brakes `elapsed_s (R, T)` ≥ 0 after it began to at `speed_mps (R, 1)`, ≥ 0."""
 
 
 class ConstantDeceleration(Driver):
     """Brakes with `a_max_mps2` to a stop; with `build_up_s` the deceleration grows linearly to it over that time.
 
-    With build-up the jerk is a_max / build_up (as in the careful and competent driver of UN R157, by way of esmini's
-    reading of it: algorithm and values in docs/measures.md).
+    With build-up the jerk is a_max / build_up, as in the careful and competent driver of UN R157, by way of esmini's
+    reading of it (docs/measures.md).
     """
 
     kind: Literal["constant_deceleration"] = "constant_deceleration"
     a_max_mps2: Annotated[float, Field(strict=True, ge=0.01, le=100)]
     build_up_s: Annotated[float, Field(strict=True, ge=0, le=100)] = 0.0
 
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        """(R, T) by the kinematics of constant jerk, then constant deceleration, then standstill."""
-        a, grows_s = self.a_max_mps2, self.build_up_s
-        first_s = np.minimum(elapsed_s, grows_s)
-        way = 0.0 * elapsed_s
-        speed = speed_mps
-        if grows_s:
-            jerk = a / grows_s
-            first_s = np.minimum(first_s, np.sqrt(2 * speed_mps / jerk))  # slow enough, it stops meanwhile
-            way = first_s * (speed_mps - jerk * first_s**2 / 6)
-            speed = np.maximum(speed_mps - jerk * grows_s**2 / 2, 0.0)
-        then_s = np.minimum(np.maximum(elapsed_s - grows_s, 0.0), speed / a)
-        result: Float = way + then_s * (speed - a * then_s / 2)
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        """(R, T) a_max, or as much of it as is built up."""
+        if self.build_up_s == 0:
+            return np.full(elapsed_s.shape, self.a_max_mps2)
+        result: Float = self.a_max_mps2 * np.minimum(elapsed_s / self.build_up_s, 1.0)
         return result
 
 
@@ -127,14 +119,14 @@ def delays_of(reaction: Reaction, uniform: Float) -> Float:
     return found
 
 
-def way_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
+def deceleration_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
     """(R, T) what a driver model says of `elapsed_s (R, T)` and `speed_mps (R, 1)`, checked. Raises InputError."""
     where = "braking.driver"
-    found = asked(driver, where, lambda: np.asarray(driver.way_m(elapsed_s, speed_mps), dtype=float))
-    what = f"{where}: {driver.kind}: way_m(elapsed_s, speed_mps)"
+    found = asked(driver, where, lambda: np.asarray(driver.deceleration_mps2(elapsed_s, speed_mps), dtype=float))
+    what = f"{where}: {driver.kind}: deceleration_mps2(elapsed_s, speed_mps)"
     if found.shape != elapsed_s.shape:
         raise InputError(f"{what}: expected shape {elapsed_s.shape}, found {found.shape}")
     wrong = ~((found >= 0) & np.isfinite(found))
     if wrong.any():
-        raise InputError(f"{what}: expected metres ≥ 0, found {found[wrong][0]}")
+        raise InputError(f"{what}: expected m/s² ≥ 0, found {found[wrong][0]}")
     return found

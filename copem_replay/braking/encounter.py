@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.braking.boxes import nearest, reach
+from copem_replay.braking.blocked import blocked
+from copem_replay.braking.boxes import nearest
 from copem_replay.braking.course import Course, EgoCourse
 from copem_replay.experiment import Experiment
 from copem_replay.onset import Looks
@@ -32,7 +33,8 @@ class Encounter:
     size_m: Float  # (2,) of the ego
     other: Float  # (3, T): x, y, yaw of the object, NaN where it is not in the log
     other_size_m: Float  # (2,)
-    reach_m: Float  # (T,): how far the ego can go before it is within the margin, inf: no limit
+    stretch_m: Float  # (2, T): from where to where the ego, on its path, is within the margin; inf: nowhere
+    spent_s: float  # when the ego that does not brake first comes within the margin
 
 
 def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: Experiment) -> tuple[Encounter, ...]:
@@ -61,8 +63,10 @@ def _may_meet(
     """
     # The frame before the onset stands for the onset itself, which may lie between two.
     first = max(int(np.searchsorted(truth.row_captured_s[rows], onset_s, side="right")) - 1, 0)
-    bound_m = ego.course(truth.row_captured_s[rows[first:]], constant_from_s).bound_m
-    rows, bound_m = rows[first:][np.isfinite(bound_m)], bound_m[np.isfinite(bound_m)]
+    rows = rows[first:]
+    course = ego.course(truth.row_captured_s[rows], constant_from_s)
+    shared = truth.row_captured_s[rows] <= course.until_s
+    rows, bound_m = rows[shared], course.bound_m[shared]
     if not len(rows):
         return False
     x, y = _ahead(ego.path, bound_m)
@@ -97,12 +101,11 @@ def _encounter(
     nearest(course.along_m[None], ego.path, ego.size_m, other, other_size, near, touch)
     if not near[0] <= margin_m:
         return None
-    # Past its last frame the ego that brakes is no farther than at the speed it had there.
-    past_m = ego.frame_m[-1] + course.speed_mps * (time_s - ego.frame_s[-1])
-    to_m = np.where(np.isinf(course.bound_m), past_m, course.bound_m)
-    limit_m = np.empty(len(time_s))
-    reach(ego.path, ego.size_m, other, other_size, margin_m, float(course.bound_m[0]), to_m, limit_m)
-    return Encounter(look_ix, time_s, course, ego.path, ego.size_m, other, other_size, limit_m)
+    stretch_m = np.empty((2, len(time_s)))
+    blocked(ego.path, ego.size_m, other, other_size, margin_m, float(course.bound_m[0]), course.bound_m, stretch_m)
+    within = (course.along_m >= stretch_m[0]) & (course.along_m <= stretch_m[1])
+    spent_s = time_s[np.argmax(within)] if within.any() else np.inf
+    return Encounter(look_ix, time_s, course, ego.path, ego.size_m, other, other_size, stretch_m, float(spent_s))
 
 
 def _unwrapped(yaw_rad: Float) -> Float:

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 
-from copem_replay.braking.boxes import nearest, required
-from copem_replay.braking.driver import Driver, Reaction, delays_of, way_of
+from copem_replay.braking.blocked import required
+from copem_replay.braking.boxes import nearest
+from copem_replay.braking.driver import Driver, Reaction, deceleration_of, delays_of
 from copem_replay.braking.encounter import Encounter
 from copem_replay.tracks import Bool, Float
 
 _CELLS = 1_000_000
 """Courses × instants held at a time (chosen: 8 MB a column)."""
-_INSTANT_S = 1e-5
-"""Before and after a touch, to tell the speed at it (chosen)."""
 _GRID_S = 0.005
 """Between the beginnings of braking that are tried for where passing turns to failing (chosen)."""
 
@@ -43,69 +43,95 @@ class Verdicts:
 def judge(encounter: Encounter, driver: Driver, brake_s: Float) -> Verdicts:
     """Verdicts for beginnings of braking (R,). Raises InputError where a driver of the user's own fails."""
     unique, back = np.unique(brake_s, return_inverse=True)
-    near, touch = np.empty(len(unique)), np.empty(len(unique))
+    found = Verdicts(*(np.full(len(unique), np.nan) for _ in range(4)))
+    touch = np.empty(len(unique))
     rows = max(1, _CELLS // len(encounter.time_s))
     for k in range(0, len(unique), rows):
-        courses = braked(encounter, driver, unique[k : k + rows], encounter.time_s[None])
+        some = slice(k, k + rows)
+        way, speed = braked(encounter, driver, unique[some])
         nearest(
-            courses, encounter.path, encounter.size_m, encounter.other, encounter.other_size_m,
-            near[k : k + rows], touch[k : k + rows],
+            way, encounter.path, encounter.size_m, encounter.other, encounter.other_size_m,
+            found.min_distance_m[some], touch[some],
         )  # fmt: skip
-    impact_s = np.where(np.isinf(touch), np.nan, np.interp(touch, np.arange(len(encounter.time_s)), encounter.time_s))
-    speed = _speed_at(encounter, driver, unique, impact_s)
-    need = np.full(len(unique), np.nan)
+        hit = np.flatnonzero(np.isfinite(touch[some]))
+        found.impact_speed_mps[k + hit] = _at(speed[hit], touch[some][hit])
+    found.impact_s[:] = _at(np.broadcast_to(encounter.time_s, (len(unique), len(encounter.time_s))), touch)
     begin_m, begin_mps, ever = _begin(encounter, unique)
-    found = np.empty(int(ever.sum()))
-    required(encounter.time_s, encounter.reach_m, unique[ever], begin_m[ever], begin_mps[ever], found)
-    need[ever] = found
-    return Verdicts(near[back], impact_s[back], speed[back], need[back])
+    late = unique >= encounter.spent_s
+    found.required_mps2[ever & late] = np.inf
+    inquired = np.flatnonzero(ever & ~late)
+    need = np.empty(len(inquired))
+    required(encounter.time_s, encounter.stretch_m, unique[inquired], begin_m[inquired], begin_mps[inquired], need)
+    found.required_mps2[inquired] = need
+    return Verdicts(*(getattr(found, name)[back] for name in Verdicts.__dataclass_fields__))
 
 
-def braked(encounter: Encounter, driver: Driver, brake_s: Float, time_s: Float) -> Float:
-    """Way along the path (R, K) when braking begins at `brake_s (R,)`, at instants `time_s (1 | R, K)`; NaN: not there.
+def _at(values: Float, place: Float) -> Float:
+    """(R,) values (R, T) at a place between the instants of each row; NaN where it is infinite."""
+    result = np.full(len(place), np.nan)
+    r = np.flatnonzero(np.isfinite(place))
+    k = place[r].astype(np.int64)
+    after = np.minimum(k + 1, values.shape[1] - 1)
+    result[r] = values[r, k] + (place[r] - k) * (values[r, after] - values[r, k])
+    return result
+
+
+def braked(encounter: Encounter, driver: Driver, brake_s: Float) -> tuple[Float, Float]:
+    """Way along the path, NaN: not in the log, and speed when braking begins at `brake_s (R,)`: (R, T) each.
 
     Who would begin after the ego's last frame never does.
     """
-    free = np.interp(time_s, encounter.time_s, encounter.course.along_m)
+    course, time_s = encounter.course, encounter.time_s
     begin_m, begin_mps, ever = _begin(encounter, brake_s)
-    after = (time_s > brake_s[:, None]) & ever[:, None]
-    elapsed = np.where(after, time_s - np.where(ever, brake_s, 0.0)[:, None], 0.0)
-    way = begin_m[:, None] + way_of(driver, elapsed, begin_mps[:, None])
-    result: Float = np.where(after, np.minimum(way, _bound(encounter, time_s)), free)
-    return result
+    begin_s = np.where(ever, brake_s, np.inf)
+    # Of each step what lies after the beginning, and the deceleration halfway through that.
+    since_s = np.maximum(np.append(time_s[:1], time_s[:-1]), begin_s[:, None])
+    after = time_s > begin_s[:, None]
+    elapsed_s = np.where(after, (since_s + time_s) / 2 - np.where(ever, brake_s, 0.0)[:, None], 0.0)
+    deceleration = deceleration_of(driver, elapsed_s, begin_mps[:, None])
+    way, speed = np.empty(elapsed_s.shape), np.empty(elapsed_s.shape)
+    _drive(
+        time_s, course.along_m, course.bound_m, course.speed_mps, begin_s, begin_m, begin_mps, deceleration, way, speed
+    )
+    return way, speed
 
 
-def _bound(encounter: Encounter, time_s: Float) -> Float:
-    """`Course.bound_m` between the instants: inf as soon as the next one has it."""
-    with np.errstate(invalid="ignore"):  # inf − inf between two instants past the end
-        found = np.interp(time_s, encounter.time_s, encounter.course.bound_m, right=np.inf)
-    return np.where(np.isnan(found), np.inf, found)
+@nb.njit(cache=True, nogil=True)
+def _drive(
+    time_s: Float, along_m: Float, bound_m: Float, recorded_mps: Float, begin_s: Float, begin_m: Float,
+    begin_mps: Float, deceleration: Float, way: Float, speed: Float,
+) -> None:  # fmt: skip
+    """Step by step; never faster than recorded, and never faster again."""
+    for r in range(len(begin_s)):
+        s, v = begin_m[r], begin_mps[r]
+        for k in range(len(time_s)):
+            if time_s[k] <= begin_s[r]:
+                way[r, k], speed[r, k] = along_m[k], recorded_mps[k]
+                continue
+            dt = time_s[k] - (begin_s[r] if k == 0 else max(time_s[k - 1], begin_s[r]))
+            a = deceleration[r, k]
+            if a * dt >= v:
+                s += v * v / (2 * a) if a > 0 else 0.0
+                v = 0.0
+            else:
+                then = min(v - a * dt, recorded_mps[k])
+                s += (v + then) / 2 * dt
+                v = then
+            way[r, k], speed[r, k] = min(s, bound_m[k]), v
 
 
 def _begin(encounter: Encounter, brake_s: Float) -> tuple[Float, Float, Bool]:
-    """Where the ego is and how fast when braking begins, and whether it does: (R,) each, 0 where it does not."""
-    at_m = _bound(encounter, brake_s)
-    ever = np.isfinite(at_m) & np.isfinite(brake_s)
-    speed = np.interp(brake_s, encounter.time_s, encounter.course.speed_mps)
-    return np.where(ever, at_m, 0.0), np.where(ever, speed, 0.0), ever
-
-
-def _speed_at(encounter: Encounter, driver: Driver, brake_s: Float, time_s: Float) -> Float:
-    """The ego's speed (R,) at one instant (R,) of each course; NaN where that is."""
-    result = np.full(len(brake_s), np.nan)
-    there = np.flatnonzero(~np.isnan(time_s))
-    around = time_s[there, None] + np.array([-_INSTANT_S, _INSTANT_S])
-    around = np.clip(around, encounter.time_s[0], encounter.time_s[-1])
-    way = braked(encounter, driver, brake_s[there], around)
-    result[there] = np.diff(way, axis=1)[:, 0] / np.diff(around, axis=1)[:, 0]
-    return result
+    """Where the ego is and how fast when braking begins, and whether it does: (R,) each."""
+    course = encounter.course
+    begin_m, begin_mps = (np.interp(brake_s, encounter.time_s, of) for of in (course.bound_m, course.speed_mps))
+    return begin_m, begin_mps, (brake_s <= course.until_s) & np.isfinite(brake_s)
 
 
 def passing(encounter: Encounter, driver: Driver, margin_m: float) -> Float:
     """Intervals [from, to] (K, 2) of the beginnings of braking, seconds, with which the ego passes.
 
     Between beginnings `_GRID_S` apart that are judged alike it is taken to be judged the same; where they differ the
-    border is found by halves. Before the onset nobody brakes.
+    border is found by halves. −inf: from the onset on, before which nobody brakes.
     """
     grid = np.append(np.arange(encounter.time_s[0], encounter.time_s[-1], _GRID_S), encounter.time_s[-1])
     good = judge(encounter, driver, grid).min_distance_m > margin_m
@@ -115,7 +141,7 @@ def passing(encounter: Encounter, driver: Driver, margin_m: float) -> Float:
         m = (a + b) / 2
         same = (judge(encounter, driver, m).min_distance_m > margin_m) == good[turns]
         a, b = np.where(same, m, a), np.where(same, b, m)
-    borders = [*([grid[0]] if good[0] else []), *((a + b) / 2), *([np.inf] if good[-1] else [])]
+    borders = [*([-np.inf] if good[0] else []), *((a + b) / 2), *([np.inf] if good[-1] else [])]
     return np.array(borders).reshape(-1, 2)
 
 
