@@ -49,7 +49,7 @@ def summary(
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and what has to be said about them. `exact`: the rows of `exact.parquet`."""
     notes: list[str] = []
-    over, _ = _clusters(table)
+    over, _ = clusters(table)
     if over is None and len(table):
         notes.append(
             f"no interval of the detected share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
@@ -76,11 +76,12 @@ def _by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {str(name): part for name, part in table.groupby("configuration", sort=False)}
 
 
-def _clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
-    """What is resampled whole (None: nothing), and the cluster of each row."""
-    log, thing = table["log"].astype(str), table["log"].astype(str) + "\n" + table["object_id"].astype(str)
+def clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
+    """What is resampled whole (`runs`, `logs`, `objects`; None: too few of either), and each row's cluster (n,)."""
+    log = table["log"].astype(str)
+    thing = log + "\n" + table["object_id"].astype(str)
     if thing.nunique() == 1:
-        return "runs", thing
+        return "runs", table["run"].astype(str)
     if log.nunique() >= FEWEST_CLUSTERS:
         return "logs", log
     return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing
@@ -188,7 +189,7 @@ def _kind(over: str | None) -> str | None:
 
 def _interval(part: pd.DataFrame, success: Bool, seed: int) -> tuple[str | None, float | None, float | None]:
     """What is resampled whole, and the limits of the share of successes over it."""
-    over, cluster = _clusters(part)
+    over, cluster = clusters(part)
     if over is None or not len(part):
         return None, None, None
     if over == "runs":

@@ -38,7 +38,7 @@ from copem_replay.plot import (
     write_figures,
 )
 from copem_replay.plot.appearance import appearances
-from copem_replay.plot.bands import band, clusters, multiplicities, resampled_incidence
+from copem_replay.plot.bands import band, multiplicities, resampled_incidence
 from copem_replay.plot.captions import percent, short_names
 from copem_replay.plot.choice import choose
 from copem_replay.plot.distances import FAIL, NEUTRAL, PASS, spread
@@ -47,6 +47,7 @@ from copem_replay.plot.story import Event
 from copem_replay.results import write_results
 from copem_replay.run import run
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence
+from copem_replay.summary import clusters
 from recordings import Obj, pedestrian, write_recording
 
 TEXT = """\

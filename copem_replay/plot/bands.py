@@ -10,28 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.statistics import CENSORED, DETECTED
-from copem_replay.summary import FEWEST_CLUSTERS
 from copem_replay.tracks import Float, Int
 
 RESAMPLES = 400
 """Of a band (chosen: its limits are then off by about 1 % of what lies between them)."""
 _CELLS = 4_000_000
 """Resamples × rows held at a time (chosen: 32 MB a column)."""
-
-
-def clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
-    """What is drawn whole (`runs`, `logs`, `objects`, None: too few of either), and the cluster of each row (n,)."""
-    log = table["log"].astype(str)
-    thing = log + "\n" + table["object_id"].astype(str)
-    if thing.nunique() == 1:
-        return "runs", table["run"].astype(str)
-    if log.nunique() >= FEWEST_CLUSTERS:
-        return "logs", log
-    return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing
 
 
 def multiplicities(names: Sequence[str], seed: int, *, resamples: int = RESAMPLES) -> Int:

@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.plot.appearance import add_note, appearances, new_figure, style
-from copem_replay.plot.bands import RESAMPLES, band, clusters
+from copem_replay.plot.bands import RESAMPLES, band
 from copem_replay.plot.captions import list_rates, short_names, study
 from copem_replay.plot.folder import Results
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence
-from copem_replay.summary import FEWEST_CLUSTERS
+from copem_replay.summary import FEWEST_CLUSTERS, clusters
 from copem_replay.tracks import Float, Int
 
 if TYPE_CHECKING:
