@@ -44,9 +44,11 @@ def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool
     out = Detections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
     # From when on a list is no longer gone by: at its greatest age, within a microsecond, it still is.
     outdated_s = np.minimum(_superseded_s(heard)[heard.frame_ix], arrives_s + max_age_s + 2 * _TOLERANCE_S)
+    # One hit confirms at once, whatever the instants.
+    cluster = capture_instants(heard) if confirm.hits > 1 else np.zeros(len(heard.stamp_ns), dtype=np.int64)
     _first(
         heard.valid, order, bounds, arrives_s, captured_s, outdated_s, heard.row_unit_ix,
-        capture_instants(heard)[heard.frame_ix], heard.frame_ix, heard.frame_unit_ix,
+        cluster[heard.frame_ix], heard.frame_ix, heard.frame_unit_ix,
         not_before_s, found.ended_s + _TOLERANCE_S,
         confirm.hits, confirm.of, out.detection_s, out.captured_s, out.first_unit_ix,
     )  # fmt: skip

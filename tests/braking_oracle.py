@@ -60,19 +60,6 @@ class Outcome:
     distance: Callable[[Array], Array]
 
 
-def braking_table(speed_mps: float, a_max_mps2: float, build_up_s: float, until_s: float) -> tuple[Array, Array, Array]:
-    """Seconds since braking began, metres driven and speed, millisecond by millisecond."""
-    time, way, speed = [0.0], [0.0], [speed_mps]
-    while time[-1] < until_s:
-        middle = time[-1] + STEP_S / 2
-        deceleration = a_max_mps2 * min(middle / build_up_s, 1.0) if build_up_s > 0 else a_max_mps2
-        slower = max(speed[-1] - deceleration * STEP_S, 0.0)
-        way.append(way[-1] + (speed[-1] + slower) / 2 * STEP_S)
-        speed.append(slower)
-        time.append(time[-1] + STEP_S)
-    return np.array(time), np.array(way), np.array(speed)
-
-
 class Ego:
     """The ego that drives as recorded, or with constant speed from an instant on, until it brakes."""
 
@@ -84,32 +71,44 @@ class Ego:
         self.brake_s = math.inf
 
     def free(self, time_s: Array) -> tuple[Array, Array]:
-        """Way and speed, had it not braked."""
+        """Way and speed, had it not braked; past its last frame it would have gone on as fast as there."""
+        m = self.motion
         if self.constant_from_s is None:
-            way = np.interp(time_s, self.motion.time_s, self.frame_m)
-            return way, np.interp(time_s, self.motion.time_s, self.motion.speed_mps)
-        start = np.interp(self.constant_from_s, self.motion.time_s, self.frame_m)
-        speed = np.interp(self.constant_from_s, self.motion.time_s, self.motion.speed_mps)
+            beyond = np.maximum(time_s - m.time_s[-1], 0.0) * m.speed_mps[-1]
+            return np.interp(time_s, m.time_s, self.frame_m) + beyond, np.interp(time_s, m.time_s, m.speed_mps)
+        start = np.interp(self.constant_from_s, m.time_s, self.frame_m)
+        speed = np.interp(self.constant_from_s, m.time_s, m.speed_mps)
         return start + speed * (time_s - self.constant_from_s), np.full(len(time_s), speed)
 
     def brakes(self, brake_s: float, a_max_mps2: float, build_up_s: float, until_s: float) -> None:
-        """From `brake_s` on; who would begin after the last frame never does."""
-        if brake_s > (self.motion.time_s[-1] if self.constant_from_s is None else until_s):
+        """From `brake_s` on, never faster than recorded and never faster again; not when it is gone from the log."""
+        if math.isinf(brake_s) or (self.constant_from_s is None and brake_s > self.motion.time_s[-1] + EDGE_S):
             return
         self.brake_s = brake_s
-        (way,), (speed,) = self.free(np.array([brake_s]))
-        self.begin_m = way
-        self.table = braking_table(speed, a_max_mps2, build_up_s, max(until_s - brake_s, 0.0) + 1.0)
+        elapsed = np.arange(0.0, max(until_s - brake_s, 0.0) + 2 * STEP_S, STEP_S)
+        free_m, free_mps = self.free(brake_s + elapsed)
+        way, speed = [float(free_m[0])], [float(free_mps[0])]
+        for k in range(1, len(elapsed)):
+            middle = elapsed[k] - STEP_S / 2
+            deceleration = a_max_mps2 * min(middle / build_up_s, 1.0) if build_up_s > 0 else a_max_mps2
+            slower = min(max(speed[-1] - deceleration * STEP_S, 0.0), float(free_mps[k]))
+            way.append(way[-1] + (speed[-1] + slower) / 2 * STEP_S)
+            speed.append(slower)
+        self.table = elapsed, np.array(way), np.array(speed)
 
     def way(self, time_s: Array) -> Array:
-        """Metres along the path at instants (K,)."""
+        """Metres along the path at instants (K,), never farther than without braking."""
         free, _ = self.free(time_s)
         if math.isinf(self.brake_s):
             return free
-        braked = self.begin_m + np.interp(time_s - self.brake_s, self.table[0], self.table[1])
-        recorded_still = self.constant_from_s is not None or time_s <= self.motion.time_s[-1]
-        limited = np.where(recorded_still, np.minimum(braked, free), braked)
-        return np.where(time_s > self.brake_s, limited, free)
+        braked = np.interp(time_s - self.brake_s, self.table[0], self.table[1])
+        return np.where(time_s > self.brake_s, np.minimum(braked, free), free)
+
+    def speed(self, time_s: float) -> float:
+        """Speed at an instant."""
+        if time_s > self.brake_s:
+            return float(np.interp(time_s - self.brake_s, self.table[0], self.table[2]))
+        return float(self.free(np.array([time_s]))[1][0])
 
     def there(self, time_s: Array, max_gap_s: float) -> npt.NDArray[np.bool_]:
         """An ego that was made to brake or to keep its speed is there whether recorded or not."""
@@ -118,17 +117,12 @@ class Ego:
         return self.motion.there(time_s, max_gap_s) | (time_s > self.brake_s)
 
     def places(self, time_s: Array) -> tuple[Array, Array, Array]:
-        """x, y and yaw at instants (K,): on the recorded path, straight on beyond its end."""
+        """x, y and yaw at instants (K,): on the recorded path, straight on ahead beyond its end."""
         m, way = self.motion, self.way(time_s)
         x, y = np.interp(way, self.frame_m, m.x_m), np.interp(way, self.frame_m, m.y_m)
         yaw = np.interp(way, self.frame_m, np.unwrap(m.yaw_rad))
-        moved = np.flatnonzero(np.diff(self.frame_m) > 1e-6)
-        if len(moved):
-            k, beyond = moved[-1], np.maximum(way - self.frame_m[-1], 0.0)
-            length = self.frame_m[k + 1] - self.frame_m[k]
-            x = x + beyond * (m.x_m[k + 1] - m.x_m[k]) / length
-            y = y + beyond * (m.y_m[k + 1] - m.y_m[k]) / length
-        return x, y, yaw
+        beyond = np.maximum(way - self.frame_m[-1], 0.0)
+        return x + beyond * np.cos(m.yaw_rad[-1]), y + beyond * np.sin(m.yaw_rad[-1]), yaw
 
 
 def corners(x: Array, y: Array, yaw: Array, length_m: float, width_m: float) -> Array:
@@ -187,6 +181,4 @@ def outcome(
     if not len(touching):
         return Outcome(float(found.min()), None, None, distance)
     touch_s = float(time_s[touching[0]])
-    start_s = max(touch_s - 2e-5, onset_s)
-    before, after = driven.way(np.array([start_s, start_s + 2e-5]))
-    return Outcome(0.0, touch_s, float((after - before) / 2e-5), distance)
+    return Outcome(0.0, touch_s, driven.speed(touch_s), distance)

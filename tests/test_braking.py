@@ -100,27 +100,31 @@ CAREFUL = ConstantDeceleration(a_max_mps2=0.774 * G, build_up_s=0.6)
 """The careful and competent driver of UN R157, by way of esmini's reading of it."""
 
 
-def way(driver: Driver, elapsed_s: float, speed_mps: float) -> float:
-    return float(driver.way_m(np.array([[elapsed_s]]), np.array([[speed_mps]]))[0, 0])
+def drives_on(driver: Driver, speed_mps: float, until_s: float = 20.0) -> tuple[Float, Float, Float]:
+    """Instants, way and speed of who begins to brake at 0 s, every 10 ms."""
+    encounter = in_conflict(in_the_way(speed_mps * until_s / 2, speed_mps=speed_mps, until_s=until_s))
+    way, speed = braked(encounter, driver, np.array([0.0]))
+    return encounter.time_s, way[0], speed[0]
 
 
 @pytest.mark.parametrize(
-    ("speed_mps", "a_max", "stops_after_m"), [(10, 8, 6.25), (20, 8, 25), (10, 5, 10), (0, 8, 0), (1, 0.01, 50)]
+    ("speed_mps", "a_max", "stops_after_m"), [(10, 8, 6.25), (20, 8, 25), (10, 5, 10), (1, 0.1, 5)]
 )
 def test_to_a_stop_takes_the_square_of_the_speed(speed_mps: float, a_max: float, stops_after_m: float) -> None:
-    driver = ConstantDeceleration(a_max_mps2=a_max)
+    time_s, way, speed = drives_on(ConstantDeceleration(a_max_mps2=a_max), speed_mps)
     stops_s = speed_mps / a_max
-    assert way(driver, stops_s, speed_mps) == pytest.approx(stops_after_m)
-    assert way(driver, stops_s + 1e6, speed_mps) == pytest.approx(stops_after_m), "and there it stays"
-    assert way(driver, stops_s / 2, speed_mps) == pytest.approx(stops_after_m * 3 / 4), "half the time, ¾ of the way"
+    assert way[-1] == pytest.approx(stops_after_m)
+    assert speed[-1] == 0
+    half = np.interp(stops_s / 2, time_s, way), np.interp(stops_s / 2, time_s, speed)
+    assert half == pytest.approx((stops_after_m * 3 / 4, speed_mps / 2), abs=1e-3), "half the time, ¾ of the way"
 
 
 @pytest.mark.parametrize(
     ("speed_mps", "with_risk_m", "without_m"), [(10.0, 20.97, 16.97), (13.89, 32.73, 27.18), (16.67, 42.36, 35.69)]
 )
 def test_the_careful_driver_of_r157(speed_mps: float, with_risk_m: float, without_m: float) -> None:
-    # Perceives the risk for 0.4 s and delays 0.75 s, at full speed; the totals are published by esmini.
-    stopping = way(CAREFUL, 60.0, speed_mps)
+    # Perceives the risk for 0.4 s and delays 0.75 s, at full speed; the totals are those of esmini.
+    stopping = drives_on(CAREFUL, speed_mps)[1][-1]
     assert speed_mps * (0.4 + 0.75) + stopping == pytest.approx(with_risk_m, abs=5e-3)
     assert speed_mps * 0.75 + stopping == pytest.approx(without_m, abs=5e-3)
 
@@ -135,38 +139,33 @@ def test_the_careful_driver_within_a_scene() -> None:
         assert row.min_distance_m == pytest.approx(range_m - 20.97, abs=5e-3)
 
 
-def test_stopping_while_the_deceleration_grows() -> None:
-    # Jerk 8 m/s³: 1 m/s is gone when 4 t² = 1, after 0.5 s and ⅔ of what it would have driven. No jump where the
-    # deceleration is reached: 4 m/s is gone in exactly the second it grows, after ⅔ · 4 m.
-    driver = ConstantDeceleration(a_max_mps2=8.0, build_up_s=1.0)
-    assert way(driver, 0.5, 1.0) == pytest.approx(1 / 3)
-    assert way(driver, 9.0, 1.0) == pytest.approx(1 / 3)
-    assert way(driver, 0.25, 1.0) == pytest.approx(0.25 - 8 * 0.25**3 / 6)
-    assert way(driver, 9.0, 4.0) == pytest.approx(8 / 3)
-    # At 5 m/s it is 1 m/s when the deceleration is reached, after 5 − 8/6 m, and 1/16 m later it stands.
-    assert way(driver, 9.0, 5.0) == pytest.approx(5 - 8 / 6 + 1 / 16)
-    assert way(driver, 9.0, 0.0) == 0.0
-
-
-@given(
-    speed_mps=st.floats(0, 60),
-    a_max=st.floats(0.01, 100),
-    build_up_s=st.just(0.0) | st.floats(1e-6, 100),
+@pytest.mark.parametrize(
+    ("speed_mps", "stops_s", "stops_after_m"),
+    [(1.0, 0.5, 1 / 3), (4.0, 1.0, 8 / 3), (5.0, 1.125, 5 - 8 / 6 + 1 / 16), (0.0625, 0.125, 0.0625 / 12)],
 )
+def test_stopping_while_the_deceleration_grows(speed_mps: float, stops_s: float, stops_after_m: float) -> None:
+    """Jerk 8 m/s³ up to 8 m/s².
+
+    1 m/s is gone when 4 t² = 1, after ⅔ of what it would have driven; so are 1/16 m/s, and so are 4 m/s just when the
+    deceleration is reached. Of 5 m/s one is left then, after 5 − 8/6 m, and 1/16 m on it stands.
+    """
+    time_s, way, speed = drives_on(ConstantDeceleration(a_max_mps2=8.0, build_up_s=1.0), speed_mps)
+    assert way[-1] == pytest.approx(stops_after_m, abs=1e-4)
+    assert time_s[np.flatnonzero(speed == 0)[0]] == pytest.approx(stops_s, abs=0.011)
+
+
+@SOME
+@given(speed_mps=st.floats(0.5, 40), a_max=st.floats(2, 100), build_up_s=st.just(0.0) | st.floats(1e-6, 3))
 def test_braking_only_slows(speed_mps: float, a_max: float, build_up_s: float) -> None:
-    time_s = np.concatenate([[0.0], np.geomspace(1e-6, 1e5, 400)])
-    found = ConstantDeceleration(a_max_mps2=a_max, build_up_s=build_up_s).way_m(time_s[None], np.array([[speed_mps]]))[
-        0
-    ]
-    mean_mps = np.diff(found) / np.diff(time_s)
-    assert found[0] == 0.0
-    assert (mean_mps >= -1e-9).all()
-    assert (mean_mps <= speed_mps * (1 + 1e-6) + 1e-9).all()
-    assert (np.diff(mean_mps) <= 1e-6 * (1 + speed_mps)).all(), "never faster again"
-    # Slower than with the full deceleration at once, and by less than the way of the time it grows.
+    _, way, speed = drives_on(ConstantDeceleration(a_max_mps2=a_max, build_up_s=build_up_s), speed_mps, 30.0)
+    assert (np.diff(way) >= 0).all()
+    assert (np.diff(speed) <= 0).all()
+    assert speed[-1] == 0
+    np.testing.assert_allclose(np.diff(way), (speed[1:] + speed[:-1]) / 2 * 0.01, atol=a_max * 0.01**2)
+    # Farther than with the full deceleration at once, but by less than the way of the time it grows.
     at_once = speed_mps**2 / 2 / a_max
-    if at_once < 1e4:
-        assert at_once * (1 - 1e-9) <= found[-1] <= at_once + speed_mps * build_up_s + 1e-6
+    rounding = a_max * 0.01**2
+    assert at_once - rounding <= way[-1] <= at_once + speed_mps * build_up_s + rounding
 
 
 # ---------------------------------------------------------------------------------------------------------- reactions
@@ -321,8 +320,10 @@ def test_the_object_has_left_the_way() -> None:
     assert found.min_distance_m[0] > 0.5
     assert found.min_distance_m[1] == pytest.approx(0.3 * 5 / math.sqrt(26), abs=1e-3)
     assert np.isnan(found.impact_s).all()
-    there_m = braked(encounter, driver, np.array([0.0]), np.array([[(5 - math.sqrt(7.25)) / 0.5]]))
-    assert there_m[0, 0] == pytest.approx(17.75), "it has not stopped for him"
+    way, speed = braked(encounter, driver, np.array([0.0]))
+    there_s = (5 - math.sqrt(7.25)) / 0.5
+    assert np.interp(there_s, encounter.time_s, way[0]) == pytest.approx(17.75, abs=1e-3)
+    assert np.interp(there_s, encounter.time_s, speed[0]) == pytest.approx(math.sqrt(7.25), abs=1e-3), "it drives on"
 
 
 def test_walking_into_the_standing_ego() -> None:
@@ -336,7 +337,14 @@ def test_walking_into_the_standing_ego() -> None:
         np.testing.assert_array_equal(found.min_distance_m, 0)
         np.testing.assert_allclose(found.impact_s, 7.75 / 1.5, atol=1e-6)
         np.testing.assert_allclose(found.impact_speed_mps, 0.0, atol=1e-9)
-        np.testing.assert_array_equal(found.required_mps2, [np.inf, np.inf, np.nan])
+
+
+def test_no_deceleration_helps_who_stands_in_the_way() -> None:
+    walker = Thing("walker", "pedestrian", driving(10, 0, -1.5))
+    encounter = in_conflict(recording([Thing("ego", "car", standing(0, 0)), walker], until_s=8.0))
+    found = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.0, 3.0, NEVER]))
+    np.testing.assert_array_equal(found.min_distance_m, 0)
+    np.testing.assert_array_equal(found.required_mps2, [np.inf, np.inf, np.nan])
 
 
 def test_too_late_for_who_walks_into_its_side() -> None:
@@ -444,43 +452,6 @@ def motion(log: Recording, k: int) -> Motion:
     return Motion(truth.row_captured_s[rows], x, y, yaw, np.hypot(vx, vy), float(length[0]), float(width[0]))
 
 
-@st.composite
-def stoppable(draw: st.DrawFn) -> Recording:
-    """A pedestrian who crosses once, or a car ahead that is slower or brakes: braking harder always helps."""
-    meet_s, speed = draw(st.floats(1.5, 3.5)), draw(st.floats(5, 18))
-    ego = Drive(speed)
-    if draw(st.booleans()):
-        heading = draw(st.sampled_from([-1, 1])) * draw(st.floats(math.pi / 3, 2 * math.pi / 3))
-        offset = draw(st.floats(-1.5, 3.5)), draw(st.floats(-2, 2))
-        other = Drive(draw(st.floats(0.7, 3)), (speed * meet_s + offset[0], offset[1]), meet_s, heading)
-        return two(ego, other, "pedestrian", until_s=meet_s + 4)
-    gap, slower = draw(st.floats(1, 20)), draw(st.floats(0, speed))
-    other = Drive(
-        slower, (4 + gap, draw(st.floats(-1, 1))), slows_s=draw(st.floats(0, 3)), deceleration=draw(st.floats(1, 9))
-    )
-    return two(ego, other, "car", until_s=8.0)
-
-
-@SOME
-@given(log=stoppable(), begins=st.floats(0, 1), a_max=st.floats(0.5, 12))
-def test_passes_just_when_it_can_brake_harder_than_required(log: Recording, begins: float, a_max: float) -> None:
-    encounter = meeting(log, plan())
-    assume(encounter is not None)
-    assert encounter is not None
-    unbraked = outcome(motion(log, 0), motion(log, 1), onset_s=0.0)
-    near = np.arange(0.0, log.scene.end_s, 0.005)
-    too_near_s = near[unbraked.distance(near) <= 0.5 + 0.1]
-    assume(len(too_near_s) and too_near_s[0] > 0)
-    brake_s = begins * too_near_s[0]
-    (needed,) = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([brake_s])).required_mps2
-    for a in (a_max, needed * 1.01, needed * 0.99):
-        if 0.01 <= a <= 100 and abs(a - needed) > 0.005 * needed:
-            driver = ConstantDeceleration(a_max_mps2=a)
-            (least,) = judge(encounter, driver, np.array([brake_s])).min_distance_m
-            if abs(least - 0.5) > 1e-3:
-                assert (least > 0.5) == (needed < a)
-
-
 # -------------------------------------------------------------------------------------------------------- the oracle
 
 
@@ -517,13 +488,16 @@ class Case:
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
     """The other is near the ego's place at some instant, and there is nothing else they have in common."""
-    meet_s = draw(st.floats(1, 4))
+    meet_s, constant_speed = draw(st.floats(1, 4)), draw(st.booleans())
     bend = st.just(0.0) | st.floats(1 / 60, 1 / 8) | st.floats(-1 / 8, -1 / 60)
     slowing = draw(st.booleans())
+    leaves_s = draw(st.just(math.inf) | st.floats(0.5, 5))
+    # Which way is straight on, where it stopped in a bend, is known to a decimetre of the path only.
+    open_end = slowing and (constant_speed or leaves_s < math.inf)
     ego = Drive(
-        draw(st.just(0.0) | st.floats(2, 20)),
+        draw(st.just(0.0) | st.floats(3, 20)),
         heading_rad=draw(st.just(0.0) | st.floats(-4, 4)),
-        curvature=draw(bend),
+        curvature=0.0 if open_end else draw(bend),
         slows_s=draw(st.floats(0, 4)) if slowing else math.inf,
         deceleration=draw(st.floats(1, 7)) if slowing else 0.0,
     )
@@ -538,14 +512,50 @@ def cases(draw: st.DrawFn) -> Case:
         draw(st.floats(1, 7)),
     )
     until_s = meet_s + draw(st.floats(0.5, 3))
-    # An ego that leaves does not slow down before: what is known of where it would have driven on is another matter.
-    leaves_s = draw(st.just(math.inf) | st.floats(0.5, 5)) if not slowing else math.inf
     gap_from_s = draw(st.just(math.inf) | st.floats(0, meet_s))
     return Case(
         ego, other, draw(st.sampled_from(["pedestrian", "car", "truck"])), until_s,
-        draw(st.sampled_from([10.0, 4.0, 25.0])), leaves_s, (gap_from_s, min(gap_from_s + 1.2, until_s - 0.5)),
-        draw(st.none() | st.just(0.0) | st.floats(0, 0.9)), draw(st.booleans()),
+        draw(st.sampled_from([10.0, 4.0, 25.0, 1e9 / 33_333_333])), leaves_s,
+        (gap_from_s, gap_from_s + draw(st.floats(0.6, 3))),
+        draw(st.none() | st.just(0.0) | st.floats(0, 0.9)), constant_speed,
     )  # fmt: skip
+
+
+@st.composite
+def stoppable(draw: st.DrawFn) -> Case:
+    """A pedestrian who crosses once, or a car ahead that is slower or brakes: braking harder always helps."""
+    meet_s, speed = draw(st.floats(1.5, 3.5)), draw(st.floats(5, 18))
+    if draw(st.booleans()):
+        heading = draw(st.sampled_from([-1, 1])) * draw(st.floats(math.pi / 3, 2 * math.pi / 3))
+        place = speed * meet_s + draw(st.floats(-1.5, 3.5)), draw(st.floats(-2, 2))
+        kind, until_s, other = "pedestrian", meet_s + 4, Drive(draw(st.floats(0.7, 3)), place, meet_s, heading)
+    else:
+        place, brakes_s = (4 + draw(st.floats(1, 20)), draw(st.floats(-1, 1))), draw(st.floats(0, 3))
+        slower = Drive(draw(st.floats(0, speed)), place, slows_s=brakes_s, deceleration=draw(st.floats(1, 9)))
+        kind, until_s, other = "car", 8.0, slower
+    return Case(Drive(speed), other, kind, until_s, 10.0, math.inf, (math.inf, math.inf), None, False)
+
+
+@SOME
+@given(case=stoppable(), begins=st.floats(0, 1), a_max=st.floats(0.5, 12))
+def test_passes_just_when_it_can_brake_harder_than_required(case: Case, begins: float, a_max: float) -> None:
+    log = case.log()
+    encounter = meeting(log, plan())
+    assume(encounter is not None)
+    assert encounter is not None
+    unbraked = outcome(motion(log, 0), motion(log, 1), onset_s=0.0)
+    near = np.arange(0.0, log.scene.end_s, 0.005)
+    too_near_s = near[unbraked.distance(near) <= 0.5 + 0.1]
+    assume(len(too_near_s) and too_near_s[0] > 0)
+    brake_s = begins * too_near_s[0]
+    (needed,) = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([brake_s])).required_mps2
+    for a in (a_max, needed * 1.01, needed * 0.99):
+        if 0.01 <= a <= 100 and abs(a - needed) > 0.005 * needed:
+            driver = ConstantDeceleration(a_max_mps2=a)
+            (least,) = judge(encounter, driver, np.array([brake_s])).min_distance_m
+            # Found for instants 10 ms apart; between two of them corners come nearer by (v · 5 ms)² / 2 · 0.5 m.
+            if abs(least - 0.5) > 0.01:
+                assert (least > 0.5) == (needed < a)
 
 
 def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Float) -> bool:
@@ -585,11 +595,12 @@ def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Fl
     return True
 
 
-@settings(SOME, max_examples=120)
+@pytest.mark.long
+@settings(SOME, max_examples=100)
 @given(
     case=cases(),
     a_max=st.floats(1, 10),
-    build_up_s=st.just(0.0) | st.floats(0.01, 1),
+    build_up_s=st.just(0.0) | st.floats(0.2, 1),  # where it ends within a step of 10 ms, v · (10 ms)² / 8 / it is lost
     margin_m=st.sampled_from([0.0, 0.5, 2.0]),
     begins_s=st.lists(st.floats(0, 5), min_size=2, max_size=3),
 )
@@ -610,12 +621,16 @@ def test_named_encounters_as_the_oracle_says() -> None:
         "ego on a curve": replace(everywhere, ego=Drive(9, curvature=1 / 15), other=Drive(1.5, (14.8, 13), 2.3, 2.5)),
         "ego brakes by itself": replace(everywhere, ego=Drive(12, slows_s=0.7, deceleration=3)),
         "ego leaves first": replace(everywhere, other=Drive(1.5, (13.5, 0), 1.0, 1.6), ego_leaves_s=1.25),
-        "a gap when it is hit": replace(everywhere, gap_s=(1.5, 3.05)),
+        "a gap when it is hit": replace(everywhere, gap_s=(1.5, 2.65)),
         "from behind": replace(everywhere, ego=Drive(4, slows_s=1.0, deceleration=2), other=Drive(9, (-12, 0.7))),
+        "between two frames": replace(everywhere, other=Drive(20, (12.5, 0), 1.25, math.pi / 2), rate_hz=2.0),
+        "ego slows and leaves": replace(
+            everywhere, ego=Drive(10, slows_s=1, deceleration=5), other=Drive(0, (21.6, 0)), ego_leaves_s=2.0
+        ),
     }
     for name, case in named.items():
         for driver in (ConstantDeceleration(a_max_mps2=8.0), ConstantDeceleration(a_max_mps2=4.0, build_up_s=0.5)):
-            begins_s = np.array([0.0, 0.4, 0.8, 1.1, 1.2, 1.3, 2.5, 9.0, NEVER])
+            begins_s = np.array([0.4, 1.1, 1.3, 2.5, NEVER])
             assert agree(case, driver, 0.5, begins_s), f"{name}: not in conflict"
 
 
@@ -671,7 +686,7 @@ def test_instants_to_begin_at() -> None:
     # Braking at b the front stops at 8.25 + 10 b: short of the first place when that is below 21.5 (b < 1.325), and
     # clear of the second when the front is below 11.25 (b < 0.3), or the rear, 4 m behind, above 12.75 (b > 0.85).
     encounter, driver = in_conflict(back_and_forth()), ConstantDeceleration(a_max_mps2=8.0)
-    np.testing.assert_allclose(passing(encounter, driver, 0.5), [[0.0, 0.3], [0.85, 1.325]], atol=1e-4)
+    np.testing.assert_allclose(passing(encounter, driver, 0.5), [[-np.inf, 0.3], [0.85, 1.325]], atol=1e-4)
     # With 4 m/s² it stops at 14.5 + 10 b: short of the first place for b < 0.7, behind the second for b > 0.225.
     np.testing.assert_allclose(passing(encounter, ConstantDeceleration(a_max_mps2=4.0), 0.5), [[0.225, 0.7]], atol=1e-4)
     # With 2 m/s² it needs 25 m.
@@ -702,7 +717,7 @@ def test_passing_is_what_is_judged(case: Case, a_max: float, build_up_s: float, 
 def test_probability_to_pass_with_one_interval() -> None:
     # `in_the_way`: with 8 m/s² it passes when it begins before 1.325 s (2 + 10 b + 6.25 = 21.5).
     between_s = passing(in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), 0.5)
-    np.testing.assert_allclose(between_s, [[0.0, 1.325]], atol=1e-4)
+    np.testing.assert_allclose(between_s, [[-np.inf, 1.325]], atol=1e-4)
     known_s = np.array([0.0, 0.3, 1.0, 1.3249, 1.33, 5.0, NEVER])
     left_s = between_s[0, 1] - known_s
     gamma = GammaReaction(shape=1.41, mean_s=0.282)
@@ -742,11 +757,13 @@ def test_who_brakes_earlier_is_never_farther(
     """For an ego that keeps its speed until it brakes, however it is made to."""
     driver = ConstantDeceleration(a_max_mps2=a_max, build_up_s=build_up_s)
     case = replace(case, constant_speed=True)
-    encounter = meeting(case.log(), case.plan(driver, 100.0))
+    encounter = meeting(case.log(), case.plan(driver, 3.0))
     assume(encounter is not None)
     assert encounter is not None
-    early, late, free = braked(encounter, driver, np.array([*sorted(begins_s), NEVER]), encounter.time_s[None])
-    assert (early <= late + 1e-9).all()
+    brake_s = np.maximum(np.array([*sorted(begins_s), NEVER]), encounter.time_s[0])
+    (early, late, free), _ = braked(encounter, driver, brake_s)
+    rounding = a_max * 0.01**2
+    assert (early <= late + rounding).all()
     assert (late <= free + 1e-9).all()
     assert (np.diff(early) >= -1e-9).all(), "forward, or not at all"
 
@@ -860,9 +877,19 @@ def test_the_declared_driver_never_gets_farther_than_was_driven() -> None:
     walker = Thing("walker", "pedestrian", standing(2 + 20.2 + 0.25, 0))
     log = recording([Thing("ego", "car", Drive(10, slows_s=1.0, deceleration=5.0).at), walker], until_s=6.0)
     encounter = in_conflict(log)
-    weak = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]), encounter.time_s[None])[0]
-    np.testing.assert_allclose(weak[-1], 20.0, atol=0.01)
+    (weak,), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]))
+    # At 1 s it is 0.25 m behind with 9 m/s, and 1/6 m more when after 1/3 s both have 8⅓ m/s; from there as recorded.
+    np.testing.assert_allclose(weak[-1], 20 - 1 / 4 - 1 / 6, atol=0.01)
     assert (weak <= encounter.course.along_m + 1e-9).all()
+
+
+def test_nor_where_its_speedometer_exaggerates() -> None:
+    # Velocities a tenth above what the places say: from 1 s on, hardly braking, it would be 1 m ahead after 1 s.
+    log = in_the_way(20)
+    exaggerating = replace(log, truth=replace(log.truth, vx_mps=log.truth.vx_mps * 1.1))
+    encounter = in_conflict(exaggerating)
+    (way,), _ = braked(encounter, ConstantDeceleration(a_max_mps2=0.01), np.array([1.0]))
+    assert (way <= encounter.course.along_m + 1e-9).all()
 
 
 def test_one_reaction_for_all_configurations_and_in_any_batch() -> None:
@@ -924,12 +951,12 @@ def test_two_at_once_are_judged_each_by_itself() -> None:
 
 
 class Coasts(Driver):
-    """Loses a share of its speed every second: v · (1 − e^(−t·k)) / k metres."""
+    """Loses a share of its speed every second: v · e^(−k·t), and so v · (1 − e^(−k·t)) / k metres."""
 
     per_s: float
 
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        result: Float = speed_mps * -np.expm1(-elapsed_s * self.per_s) / self.per_s
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        result: Float = self.per_s * speed_mps * np.exp(-elapsed_s * self.per_s)
         return result
 
 
@@ -941,28 +968,33 @@ class Attentive(Reaction):
 
 
 class Crashes(Driver):
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
         return elapsed_s.no_such_thing  # type: ignore[attr-defined, no-any-return]
 
 
 class Flat(Driver):
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
         return elapsed_s[0]
 
 
-class Reverses(Driver):
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        return -elapsed_s
+class Speeds(Driver):
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        return elapsed_s - 1.0
 
 
 class Forgets(Driver):
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
         return elapsed_s * np.nan
 
 
+class Wall(Driver):
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        return np.full(elapsed_s.shape, np.inf)
+
+
 class Text(Driver):
-    def way_m(self, elapsed_s: Float, speed_mps: Float) -> Float:
-        return np.full(elapsed_s.shape, "far")  # type: ignore[return-value]
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        return np.full(elapsed_s.shape, "hard")  # type: ignore[return-value]
 
 
 class Lacks(Driver):
@@ -998,9 +1030,9 @@ def test_a_driver_and_a_reaction_of_ones_own() -> None:
     own = {"kind": "test_braking:Coasts", "per_s": 2.0, "reaction": {"kind": "test_braking:Attentive"}}
     found = rows(in_the_way(20), plan(driver=own), runs=30)
     assert {*np.round(found["brake_s"], 9)} == {0.2, 0.6}
-    # It comes to rest 10 / 2 m after it began, but for 10 / 2 · e^(−2 · 5.4) m.
+    # It comes to rest 10 / 2 m after it began, but for 10 / 2 · e^(−2 · 5.4) m and the millimetre of steps of 10 ms.
     early = found[found["brake_s"] < 0.4].iloc[0]
-    assert early["min_distance_m"] == pytest.approx(20 - 2 - 5, abs=1e-3)
+    assert early["min_distance_m"] == pytest.approx(20 - 2 - 5, abs=2e-3)
     between_s = passing(in_conflict(in_the_way(20), plan(driver=own)), Coasts(kind="x", per_s=2.0), 0.5)
     assert pass_probability(between_s, np.array([1.0]), Attentive(kind="x")) == pytest.approx(0.5)
 
@@ -1014,10 +1046,11 @@ def test_a_reaction_of_ones_own_with_a_driver_of_ours() -> None:
     ("kind", "said"),
     [
         ("Crashes", r"AttributeError: .*no_such_thing.*test_braking\.py:\d+"),
-        ("Flat", r"way_m\(elapsed_s, speed_mps\): expected shape \(1, \d+\), found \(\d+,\)"),
-        ("Reverses", r"way_m\(elapsed_s, speed_mps\): expected metres ≥ 0, found -"),
-        ("Forgets", r"way_m\(elapsed_s, speed_mps\): expected metres ≥ 0, found nan"),
-        ("Text", r"ValueError: .*'far'"),
+        ("Flat", r"deceleration_mps2\(elapsed_s, speed_mps\): expected shape \(1, \d+\), found \(\d+,\)"),
+        ("Speeds", r"deceleration_mps2\(elapsed_s, speed_mps\): expected m/s² ≥ 0, found -"),
+        ("Forgets", r"deceleration_mps2\(elapsed_s, speed_mps\): expected m/s² ≥ 0, found nan"),
+        ("Wall", r"deceleration_mps2\(elapsed_s, speed_mps\): expected m/s² ≥ 0, found inf"),
+        ("Text", r"ValueError: .*'hard'"),
     ],
 )
 def test_a_driver_that_fails_is_named(kind: str, said: str) -> None:
@@ -1044,15 +1077,13 @@ def test_a_reaction_that_fails_is_named(kind: str, said: str) -> None:
 
 
 def test_a_driver_without_its_method_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"test_braking:Lacks' lacks way_m"):
+    with pytest.raises(ValueError, match=r"test_braking:Lacks' lacks deceleration_mps2"):
         plan(driver={"kind": "test_braking:Lacks"})
 
 
-# ------------------------------------------------------------------------------------------------------- known defects
-# Each is strict: who mends it takes its mark off. What is expected is said in the head of each.
+# --------------------------------------------------------------------------------------------------------- at the edges
 
 
-@pytest.mark.xfail(reason="its last frame, alone after a gap, is interpolated with the absent one before: NaN, a touch")
 def test_an_object_that_is_back_for_its_last_frame_only() -> None:
     # 28 m ahead, gone from 1 s on and back at 3 s for one frame. Braking at 0.5 s, the ego stands 16.5 m before him.
     there: Callable[[float], bool] = lambda t: t < 1.01 or t > 2.99  # noqa: E731
@@ -1062,7 +1093,6 @@ def test_an_object_that_is_back_for_its_last_frame_only() -> None:
     assert np.isnan(found.impact_s[0])
 
 
-@pytest.mark.xfail(reason="a node some ns after the ego's last frame has it present, infinitely far along: a touch")
 def test_an_ego_whose_last_frame_is_a_few_nanoseconds_before_a_node() -> None:
     # Frames of a camera with 30 Hz, 33 333 333 ns apart: the last one of the ego at 0.99999999 s. He is 1 m away then.
     log = recording(
@@ -1076,7 +1106,6 @@ def test_an_ego_whose_last_frame_is_a_few_nanoseconds_before_a_node() -> None:
     assert meeting(log, plan()) is None
 
 
-@pytest.mark.xfail(reason="0 / 0 where the encounter is one instant", raises=RuntimeWarning)
 def test_an_object_of_one_frame_that_is_touched() -> None:
     there: Callable[[float], bool] = lambda t: abs(t - 1) < 0.01  # noqa: E731
     log = recording([straight_ego(), Thing("walker", "pedestrian", standing(11, 0), there=there)], until_s=2.0)
@@ -1085,7 +1114,6 @@ def test_an_object_of_one_frame_that_is_touched() -> None:
     assert row.impact_speed_mps == pytest.approx(10.0)
 
 
-@pytest.mark.xfail(reason="the speed is a difference across the touch, and the ego is not there on one side of it")
 @pytest.mark.parametrize(
     ("there", "touch_s", "x_m"),
     [(lambda t: t < 1.01, 1.0, 12.25), (lambda t: t < 1.01 or t > 1.99, 2.0, 20.0)],
@@ -1099,7 +1127,6 @@ def test_who_is_hit_is_hit_with_some_speed(there: Callable[[float], bool], touch
     assert found.impact_speed_mps[0] == pytest.approx(10.0)
 
 
-@pytest.mark.xfail(reason="only what follows the beginning of braking is looked at: 0 m/s² for who was hit before")
 def test_no_deceleration_helps_who_was_hit_before() -> None:
     # `crossing` is hit at 1.775 s, and out of the way at 4 s.
     found = judge(in_conflict(crossing()), ConstantDeceleration(a_max_mps2=8.0), np.array([4.0]))
@@ -1107,34 +1134,55 @@ def test_no_deceleration_helps_who_was_hit_before() -> None:
     assert found.required_mps2[0] == np.inf
 
 
-@pytest.mark.xfail(
-    reason="what is behind the ego by now limits its way, if it is ahead of where the ego was at the onset"
-)
 def test_required_deceleration_for_who_overtakes() -> None:
-    """A cyclist comes from behind in the ego's lane, overtakes it at 2.2 m to the left and cuts in, too slow."""
+    """A cyclist comes from behind in the ego's lane, overtakes it 2.2 m to the left and cuts in at 3 s, slower.
+
+    At 0.5 s he is behind the ego, yet ahead of where it was at the onset.
+    """
 
     def rides(t: float) -> tuple[float, float]:
         x = -8 + 14 * min(t, 3.2) + 5 * max(t - 3.2, 0)
-        return x, min(2.2, 7 * max(t - 0.3, 0)) if t < 3 else max(2.2 - 3 * (t - 3), 0)
+        return x, min(2.2, 3 * max(t - 0.3, 0)) if t < 3 else max(2.2 - 3 * (t - 3), 0)
 
     log = recording([straight_ego(), Thing("bicycle", "bicycle", rides, size_m=(1.8, 0.6, 1.8))], until_s=7.0)
-    driver = ConstantDeceleration(a_max_mps2=8.0)
-    found = judge(in_conflict(log), driver, np.array([0.6]))
-    assert found.min_distance_m[0] > 0.5, "it passes with 8 m/s²"
-    assert found.required_mps2[0] < 8
+    encounter = in_conflict(log)
+    (needed,) = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([0.5])).required_mps2
+    assert 0.01 < needed < 8
+    for a_max, passes in ((needed * 1.01, True), (needed * 0.99, False)):
+        found = judge(encounter, ConstantDeceleration(a_max_mps2=a_max), np.array([0.5]))
+        assert (found.min_distance_m[0] > 0.5) == passes
 
 
-@pytest.mark.xfail(reason="the ego must stay before a place that it has long passed when it is blocked again")
+@pytest.mark.xfail(reason="0 m/s²: of the places at which he blocks the path only the first is known, passed long ago")
+def test_required_deceleration_when_the_ego_comes_back() -> None:
+    """The ego drives 15 m ahead, stands from 5 s to 6 s, and reverses with 2 m/s, over who has stepped behind it.
+
+    Its rear reaches him after 6.75 m, and the margin after 6.25 m, of which 2 m are driven at 7 s: 2² / 2 · 4.25.
+    """
+
+    def turns(t: float) -> tuple[float, float]:
+        return 3 * min(t, 5) - 2 * max(t - 6, 0), 0.0
+
+    walker = Thing("walker", "pedestrian", lambda t: (6.0, max(6 - 1.2 * t, 0.0)))
+    encounter = in_conflict(recording([Thing("ego", "car", turns), walker], until_s=12.0))
+    found = judge(encounter, ConstantDeceleration(a_max_mps2=8.0), np.array([7.0, NEVER]))
+    assert found.min_distance_m[0] > 0.5
+    assert found.impact_s[1] == pytest.approx(6 + 6.75 / 2)
+    assert found.required_mps2[0] == pytest.approx(4 / 2 / 4.25, rel=1e-2)
+
+
 def test_required_deceleration_for_who_comes_back() -> None:
-    """`back_and_forth`: with 2.9 m/s² from 0 s on it stops 1.9 m past his second place, 1.24 m before his first."""
+    """`back_and_forth` from 0 s on: it has to stand before his first place, after 19.5 m: 10² / 2 · 19.5 = 2.564.
+
+    That is the smallest, not a bound: with 4 m/s² its body stands where he crosses at 8 s, with 6 m/s² before that.
+    """
     encounter, begin_s = in_conflict(back_and_forth()), np.array([0.0])
-    # 19.24 m to a stop by front: the rear, at 15.24 m, has left x = 12.75 m; 21.5 m is not reached.
-    clear = judge(encounter, ConstantDeceleration(a_max_mps2=2.9), begin_s)
-    assert clear.min_distance_m[0] > 0.5
-    assert clear.required_mps2[0] < 2.9
+    for a_max, passes in ((2.55, False), (2.6, True), (2.9, True), (4.0, False), (6.0, True)):
+        found = judge(encounter, ConstantDeceleration(a_max_mps2=a_max), begin_s)
+        assert (found.min_distance_m[0] > 0.5) == passes, a_max
+        assert found.required_mps2[0] == pytest.approx(100 / 2 / 19.5, rel=1e-2)
 
 
-@pytest.mark.xfail(reason="known at the onset with no delay: P(D ≤ to) − P(D ≤ from) leaves out D = from")
 def test_probability_to_pass_without_delay_at_the_onset() -> None:
     encounter, driver = in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0)
     between_s = passing(encounter, driver, 0.5)
@@ -1142,7 +1190,6 @@ def test_probability_to_pass_without_delay_at_the_onset() -> None:
     assert pass_probability(between_s, np.array([0.0]), ConstantReaction()).tolist() == [1.0]
 
 
-@pytest.mark.xfail(reason="straight on beyond the path's end is where its last millimetre of noise points")
 def test_constant_speed_beyond_a_stop_with_a_millimetre_of_noise() -> None:
     """Recorded, the ego stops 4 m before him and stands there for 2.5 s, known to a millimetre."""
     walker = Thing("walker", "pedestrian", standing(2 + 16.5 + 0.25, 0))
@@ -1155,19 +1202,18 @@ def test_constant_speed_beyond_a_stop_with_a_millimetre_of_noise() -> None:
     assert meeting(noisy, plan(ego="constant_speed")) is not None
 
 
-@pytest.mark.xfail(reason="past its last frame the ego jumps to where its driver alone would have braked to")
 def test_the_ego_does_not_jump_when_it_leaves() -> None:
-    # Recorded it brakes from 1 s on with 8 m/s², stands from 2.25 s on at 16.25 m and leaves; the driver begins at 0.5 s
-    # with 2 m/s², for which 5 + 10 · 1.8 − 1.8² = 19.76 m would be too far.
+    # Recorded it brakes from 1 s on with 8 m/s², stands from 2.25 s on at 16.25 m and leaves; the driver begins at
+    # 0.5 s with 2 m/s², for which 5 + 10 · 1.8 − 1.8² = 19.76 m would be too far.
     ego = Thing("ego", "car", Drive(10, slows_s=1.0, deceleration=8.0).at, there=lambda t: t < 2.31)
     log = recording([ego, Thing("walker", "pedestrian", standing(16.25 + 2.25 + 0.4, 0))], until_s=5.0)
     encounter = in_conflict(log)
-    times = np.arange(2.2, 2.5, 0.01)
-    way = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]), times[None])[0]
-    assert np.diff(way).max() <= 10.0 * 0.01
+    (way,), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([0.5]))
+    assert np.diff(way).max() <= 10.0 * 0.01 + 1e-6
+    # Behind by 0.25 m at 1 s, and by 1/12 m more when both have 8⅔ m/s.
+    assert way[-1] == pytest.approx(16.25 - 1 / 4 - 1 / 12, abs=0.02)
 
 
-@pytest.mark.xfail(reason="held back by the recorded way it loses no speed, and when that speeds up again it is faster")
 def test_who_brakes_earlier_is_never_farther_where_the_ego_slowed_down() -> None:
     """Recorded: 10 m/s, from 1 s to 2 s down to 2 m/s, from 2 s to 4 s up to 10 m/s again; the driver brakes with 2."""
 
@@ -1178,6 +1224,6 @@ def test_who_brakes_earlier_is_never_farther_where_the_ego_slowed_down() -> None
 
     log = recording([Thing("ego", "car", drives), Thing("walker", "pedestrian", standing(45, 0))], until_s=9.0)
     encounter = in_conflict(log)
-    early, late = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([1.0, 2.0]), np.array([[8.0]]))[:, 0]
-    assert late == pytest.approx(17.0, abs=0.05), "from 16 m at 2 m/s"
-    assert early <= late + 1e-6
+    (early, late), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([1.0, 2.0]))
+    assert late[-1] == pytest.approx(17.0, abs=0.05), "from 16 m at 2 m/s"
+    assert early[-1] <= late[-1] + 1e-6
