@@ -208,6 +208,10 @@ class Confirm(Frozen):
         return self
 
 
+Margin = Annotated[float, Field(strict=True, ge=0, le=100)]
+"""Metres, a hundred at most (chosen: more is a mistake)."""
+
+
 class Conflict(Frozen):
     """When a perceived state implies a collision: its predicted way meets the ego's corridor within the horizon.
 
@@ -216,7 +220,7 @@ class Conflict(Frozen):
     """
 
     horizon_s: Positive = 3.0
-    margin_m: NotNegative = 0.5
+    margin_m: Margin = 0.5
 
 
 class Measure(Frozen):
@@ -240,7 +244,7 @@ class Braking(Frozen):
     """
 
     driver: Annotated[Driver, Slot("driver", DRIVERS)]
-    margin_m: NotNegative = 0.5
+    margin_m: Margin = 0.5
     ego: Literal["recorded", "constant_speed"] = "recorded"
     brakes_for: Literal["object", "conflict"] = "object"
 

@@ -155,7 +155,7 @@ def test_stopping_while_the_deceleration_grows(speed_mps: float, stops_s: float,
 
 
 @SOME
-@given(speed_mps=st.floats(0.5, 40), a_max=st.floats(2, 100), build_up_s=st.just(0.0) | st.floats(1e-6, 3))
+@given(speed_mps=st.floats(0.5, 40), a_max=st.floats(2, 100), build_up_s=st.just(0.0) | st.floats(0.05, 3))
 def test_braking_only_slows(speed_mps: float, a_max: float, build_up_s: float) -> None:
     _, way, speed = drives_on(ConstantDeceleration(a_max_mps2=a_max, build_up_s=build_up_s), speed_mps, 30.0)
     assert (np.diff(way) >= 0).all()
@@ -748,7 +748,7 @@ def test_probability_to_pass_with_two_intervals() -> None:
 @given(
     case=cases(),
     a_max=st.floats(0.5, 12),
-    build_up_s=st.just(0.0) | st.floats(0.01, 1),
+    build_up_s=st.just(0.0) | st.floats(0.05, 1),
     begins_s=st.tuples(st.floats(0, 4), st.floats(0, 4)),
 )
 def test_who_brakes_earlier_is_never_farther(
@@ -1153,7 +1153,6 @@ def test_required_deceleration_for_who_overtakes() -> None:
         assert (found.min_distance_m[0] > 0.5) == passes
 
 
-@pytest.mark.xfail(reason="0 m/s²: of the places at which he blocks the path only the first is known, passed long ago")
 def test_required_deceleration_when_the_ego_comes_back() -> None:
     """The ego drives 15 m ahead, stands from 5 s to 6 s, and reverses with 2 m/s, over who has stepped behind it.
 

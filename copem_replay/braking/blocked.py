@@ -21,28 +21,30 @@ _INSIDE_M = 0.1
 def blocked(
     path: Float, size: Float, other: Float, other_size: Float, margin_m: float, from_m: float, to_m: Float, out: Float
 ) -> None:
-    """Which stretch of its path the other blocks: where the ego is within the margin of it, `out (2, T)`, from and to.
+    """Which stretches of its path the other blocks: where the ego is within the margin of it, `out (B, 2, T)`.
 
-    The first stretch from `from_m` on that begins before `to_m (T,)`; inf and inf where there is none. The ego advances
-    by as much as surely stays clear until nothing is left of it (sphere tracing), then step by step until it is again.
+    The first B of them from `from_m` on that begin before `to_m (T,)`, from and to; inf and inf where there are fewer.
+    The ego advances by as much as surely stays clear until nothing is left of it (sphere tracing), then step by step
+    until it is clear again.
     """
     most = turning(path, size)
+    out[:] = np.inf
     for k in range(other.shape[1]):
-        out[:, k] = np.inf
         if np.isnan(other[0, k]):
             continue
-        clear, s = from_m, from_m
-        while s <= to_m[k]:
+        clear, s, found = from_m, from_m, 0
+        while s <= to_m[k] and found < len(out):
             free = _free(path, size, other[:, k], other_size, margin_m, s)
-            if free <= 0.0:
-                out[0, k] = _border(path, size, other[:, k], other_size, margin_m, clear, s)
-                while free <= 0.0:
-                    clear, s = s, s + _INSIDE_M
-                    free = _free(path, size, other[:, k], other_size, margin_m, s)
-                out[1, k] = _border(path, size, other[:, k], other_size, margin_m, s, clear)
-                break
-            clear = s
-            s += max(free / most, _STRIDE_M)
+            if free > 0.0:
+                clear = s
+                s += max(free / most, _STRIDE_M)
+                continue
+            out[found, 0, k] = _border(path, size, other[:, k], other_size, margin_m, clear, s)
+            while free <= 0.0:
+                within, s = s, s + _INSIDE_M
+                free = _free(path, size, other[:, k], other_size, margin_m, s)
+            out[found, 1, k] = _border(path, size, other[:, k], other_size, margin_m, s, within)
+            clear, found = s, found + 1
 
 
 @nb.njit(cache=True)
@@ -70,10 +72,10 @@ def _border(
 
 @nb.njit(cache=True, nogil=True)
 def required(time_s: Float, stretch_m: Float, begin_s: Float, begin_m: Float, speed_mps: Float, out: Float) -> None:
-    """Smallest constant deceleration (R,) from `begin_s (R,)` on that is never in `stretch_m (2, T)`; inf: none.
+    """Smallest constant deceleration (R,) from `begin_s (R,)` on that is never in `stretch_m (B, 2, T)`; inf: none.
 
     At `begin_s` the ego is at `begin_m (R,)` with `speed_mps (R,)`. Each instant rules out the decelerations between
-    the one that brings the ego to the end of the stretch by then and the one that brings it to its beginning.
+    the one that brings the ego to the end of a stretch by then and the one that brings it to its beginning.
     """
     for r in range(len(out)):
         first = int(np.searchsorted(time_s, begin_s[r]))
@@ -81,12 +83,13 @@ def required(time_s: Float, stretch_m: Float, begin_s: Float, begin_m: Float, sp
         while ruled_out and a < np.inf:
             ruled_out = False
             for k in range(first, len(time_s)):
-                if stretch_m[0, k] == np.inf:
-                    continue
                 t = time_s[k] - begin_s[r]
-                most = _to_be_at(stretch_m[0, k] - begin_m[r], t, speed_mps[r])
-                if a < most and a >= _to_be_at(stretch_m[1, k] - begin_m[r], t, speed_mps[r]):
-                    a, ruled_out = most, True
+                for b in range(len(stretch_m)):
+                    if stretch_m[b, 0, k] == np.inf:
+                        break
+                    most = _to_be_at(stretch_m[b, 0, k] - begin_m[r], t, speed_mps[r])
+                    if a < most and a >= _to_be_at(stretch_m[b, 1, k] - begin_m[r], t, speed_mps[r]):
+                        a, ruled_out = most, True
         out[r] = a
 
 

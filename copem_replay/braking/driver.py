@@ -10,11 +10,14 @@ from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from copem_replay.components import Component, NotNegative, Positive, Slot, asked
 from copem_replay.errors import InputError
 from copem_replay.tracks import Float
+
+_SHORTEST_S = 0.05
+"""A deceleration that builds up faster than this is taken to be there at once (chosen: 5 steps)."""
 
 
 class Reaction(Component, ABC):
@@ -83,6 +86,14 @@ class Driver(Component, ABC):
         """(R, T) how hard it brakes `elapsed_s (R, T)` ≥ 0 after it began to at `speed_mps (R, 1)`, ≥ 0."""
 
 
+def _resolved(build_up_s: float) -> float:
+    if 0 < build_up_s < _SHORTEST_S:
+        raise ValueError(
+            f"expected 0, or at least {_SHORTEST_S:g} s (braking is worked out every 10 ms), found {build_up_s:g}"
+        )
+    return build_up_s
+
+
 class ConstantDeceleration(Driver):
     """Brakes with `a_max_mps2` to a stop; with `build_up_s` the deceleration grows linearly to it over that time.
 
@@ -92,7 +103,7 @@ class ConstantDeceleration(Driver):
 
     kind: Literal["constant_deceleration"] = "constant_deceleration"
     a_max_mps2: Annotated[float, Field(strict=True, ge=0.01, le=100)]
-    build_up_s: Annotated[float, Field(strict=True, ge=0, le=100)] = 0.0
+    build_up_s: Annotated[float, Field(strict=True, ge=0, le=100), AfterValidator(_resolved)] = 0.0
 
     def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
         """(R, T) a_max, or as much of it as is built up."""

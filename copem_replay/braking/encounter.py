@@ -21,6 +21,9 @@ from copem_replay.tracks import Float, Int, Scene, Tracks
 NODE_S = 0.01
 """Between instants of judgement (chosen: at 10 m/s² a straight line over it is off by 0.13 mm)."""
 
+_STRETCHES = 3
+"""How often the ego's path may meet a place, by a lap or in reverse (chosen)."""
+
 
 @dataclass(frozen=True)
 class Encounter:
@@ -33,7 +36,7 @@ class Encounter:
     size_m: Float  # (2,) of the ego
     other: Float  # (3, T): x, y, yaw of the object, NaN where it is not in the log
     other_size_m: Float  # (2,)
-    stretch_m: Float  # (2, T): from where to where the ego, on its path, is within the margin; inf: nowhere
+    stretch_m: Float  # (B, 2, T): from where to where the ego, on its path, is within the margin; inf: nowhere
     spent_s: float  # when the ego that does not brake first comes within the margin
 
 
@@ -101,9 +104,9 @@ def _encounter(
     nearest(course.along_m[None], ego.path, ego.size_m, other, other_size, near, touch)
     if not near[0] <= margin_m:
         return None
-    stretch_m = np.empty((2, len(time_s)))
+    stretch_m = np.empty((_STRETCHES, 2, len(time_s)))
     blocked(ego.path, ego.size_m, other, other_size, margin_m, float(course.bound_m[0]), course.bound_m, stretch_m)
-    within = (course.along_m >= stretch_m[0]) & (course.along_m <= stretch_m[1])
+    within = ((course.along_m >= stretch_m[:, 0]) & (course.along_m <= stretch_m[:, 1])).any(axis=0)
     spent_s = time_s[np.argmax(within)] if within.any() else np.inf
     return Encounter(look_ix, time_s, course, ego.path, ego.size_m, other, other_size, stretch_m, float(spent_s))
 

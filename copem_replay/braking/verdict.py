@@ -152,7 +152,8 @@ def pass_probability(between_s: Float, known_s: Float, reaction: Reaction) -> Fl
     """
     if not len(between_s):
         return np.zeros(len(known_s))
-    reached = _share_within(reaction, (between_s - known_s[:, None, None]).ravel()).reshape(len(known_s), -1, 2)
+    delay_s = between_s - np.where(np.isfinite(known_s), known_s, 0.0)[:, None, None]
+    reached = _share_within(reaction, delay_s.ravel()).reshape(len(known_s), -1, 2)
     probability: Float = (reached[:, :, 1] - reached[:, :, 0]).sum(axis=1)
     return np.where(np.isfinite(known_s), probability, 0.0)
 
