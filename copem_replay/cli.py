@@ -78,7 +78,16 @@ def check(
 ) -> int:
     """Every problem of an experiment file at once, with file and line, against its logs too."""
     source = _source(experiment, {} if ego is None else {"ego": ego}, log or [])
-    _experiment, recordings, _skipped = _ready(source, skip_unreadable=False)
+    wanted, recordings, _skipped = _ready(source, skip_unreadable=False)
+    if wanted.measure.exact and wanted.measure.confirm.hits > 1:  # whether that can be done shows with the lists
+        from copem_replay.errors import ExperimentError
+        from copem_replay.exact import check_exact
+        from copem_replay.replay import prepare
+
+        try:
+            check_exact([prepare(recording, wanted) for recording in recordings], wanted)
+        except ExperimentError as error:
+            raise InputError([source.at(("measure", "exact"), problem) for problem in error.problems]) from None
     print(_printable(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in recordings)}"))
     return 0
 
@@ -113,6 +122,8 @@ def run(
     notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite)
     _complain([f"note: {path}: skipped: {reason}" for path, reason in skipped] + [f"note: {note}" for note in notes])
     print(summary_text(result.summary))
+    if result.sweep is not None:
+        print(_printable(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {folder / 'sweep.csv'}"))
     print(_printable(f"results in {folder}"))
     return 1 if skipped else 0
 

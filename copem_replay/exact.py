@@ -36,7 +36,7 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
     braking = experiment.braking
     if braking is not None and braking.brakes_for == "conflict":
         raise ExperimentError(
-            f"{replay.scene.log}: measure.exact: perceived conflicts depend on sampled errors, and `brakes_for: "
+            f"{replay.scene.log}: exact: perceived conflicts depend on sampled errors, and `brakes_for: "
             "conflict` has no closed form; use `brakes_for: object`, or leave `exact` out"
         )
     parts = []
@@ -148,7 +148,7 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
     came = np.isfinite(heard.arrives_s[0])
     if heard.units != (TRUTH,) and (replay.fleet.share[heard.frame_unit_ix[came]] < 1).any():
         raise ExperimentError(
-            f"{replay.scene.log}: measure.exact: configuration {name}: some units are only in some runs, and "
+            f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
             "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
         )
     instants = capture_instants(heard)
@@ -157,7 +157,7 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
         mine = came & (heard.frame_unit_ix == unit)
         if not np.array_equal(np.unique(instants[mine]), everyone):
             raise ExperimentError(
-                f"{replay.scene.log}: measure.exact: configuration {name}: unit {heard.units[unit]} does not list at "
+                f"{replay.scene.log}: exact: configuration {name}: unit {heard.units[unit]} does not list at "
                 "every instant at which another does, and confirmation over such lists has no closed form; give all "
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
@@ -165,7 +165,7 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
         arrivals = heard.arrives_s[0, came & (instants == instant)]
         if np.ptp(arrivals) > _TOLERANCE_S:
             raise ExperimentError(
-                f"{replay.scene.log}: measure.exact: configuration {name}: lists captured together arrive up to "
+                f"{replay.scene.log}: exact: configuration {name}: lists captured together arrive up to "
                 f"{np.ptp(arrivals):g} s apart, and confirmation over such lists has no closed form; give all units "
                 "one latency, confirm with one hit, or leave `exact` out"
             )

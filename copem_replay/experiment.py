@@ -252,6 +252,13 @@ class Braking(Frozen):
 Units = Annotated[int, Field(strict=True, ge=0, le=10**6)]
 
 
+def _once(values: tuple[float, ...]) -> tuple[float, ...]:
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            raise ValueError(f"expected each value once, found {value:g} twice")
+    return values
+
+
 class Sweep(Frozen):
     """Values of one quantity at a time at which the configurations (by default all that it changes) are run, too.
 
@@ -260,10 +267,10 @@ class Sweep(Frozen):
     """
 
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
-    latency_s: tuple[Latency, ...] = ()
-    rate_hz: tuple[Rate, ...] = ()
-    units: tuple[Units, ...] = ()
-    share: tuple[Share, ...] = ()
+    latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    share: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
 
     @model_validator(mode="after")
     def _some(self) -> Self:

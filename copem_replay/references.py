@@ -52,23 +52,23 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
     if measure.get("exact") is True and isinstance(confirm, dict):
         of = confirm.get("of", 1)
         if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
-            message = f"exact: expected `of` at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
+            message = f"for `exact` expected `of` at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
             yield source.at(("measure", "confirm", "of"), message)
     if data.get("ego") == NO_EGO:
         for key in (("braking",), ("measure", "conflict")):
             if (braking if key[0] == "braking" else measure.get("conflict")) is not None:
-                yield source.at(key, f"{key[-1]}: there is no ego in this study (`ego: none`) to brake or collide")
+                yield source.at(key, "there is no ego in this study (`ego: none`) to brake or collide")
     if not isinstance(braking, dict) or braking.get("brakes_for") != "conflict":
         return
     if measure.get("conflict") is None:
         yield source.at(
             ("braking", "brakes_for"),
-            "brakes_for: conflict needs `measure.conflict`, such as `conflict: {horizon_s: 3}`",
+            "`conflict` needs `measure.conflict`, such as `conflict: {horizon_s: 3}`",
         )
     if measure.get("exact") is True:
         yield source.at(
             ("measure", "exact"),
-            "exact: perceived conflicts depend on sampled errors and have no closed form; use `brakes_for: object`",
+            "perceived conflicts depend on sampled errors and have no closed form; use `brakes_for: object`",
         )
 
 
@@ -87,7 +87,7 @@ def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
         if isinstance(hits, int) and hits > 1 and measure.get("exact") is True:
             yield source.at(
                 ("measure", "exact"),
-                f"exact: unit {name!r} is only in some runs, and confirmation by several hits then has no closed "
+                f"unit {name!r} is only in some runs, and confirmation by several hits then has no closed "
                 "form; confirm with one hit",
             )
 
@@ -103,9 +103,9 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             yield source.at(("sweep", "configurations", k), unknown("configuration", name, configurations))
     carried = [name for name, unit in _items(data.get("units")) if isinstance(unit.get("on"), dict)]
     if sweep.get("share") and not carried:
-        yield source.at(("sweep", "share"), "share: no unit is `on: {classes, share}`")
+        yield source.at(("sweep", "share"), "no unit is `on: {classes, share}`")
     if sweep.get("rate_hz") and not units:
-        yield source.at(("sweep", "rate_hz"), "rate_hz: the experiment has no units")
+        yield source.at(("sweep", "rate_hz"), "the experiment has no units")
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
     counts = sweep.get("units")
     for k, count in enumerate(counts if isinstance(counts, list) else []):

@@ -144,6 +144,12 @@ def _notes(replay: Replay, experiment: Experiment) -> list[str]:
         notes.append(f"no rows: the onset at {measure.onset.time_s:g} s lies after the log's end, {scene.end_s:g} s")
     elif not len(replay.looks.object_ix):
         notes.append(f"no rows: no measured object has an onset ({measure.onset.kind})")
+    if experiment.braking is not None and len(replay.looks.object_ix) and not replay.encounters:
+        how = "as recorded" if experiment.braking.ego == "recorded" else "at constant speed"
+        notes.append(
+            f"no verdict: the ego, not braking ({how}), stays more than {experiment.braking.margin_m:g} m from all that "
+            "is measured" + ("; `ego: constant_speed` asks what if nobody had braked" if how == "as recorded" else "")
+        )
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.fleet.named:
             notes.append(f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})")

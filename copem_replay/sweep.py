@@ -34,7 +34,7 @@ def points(experiment: Experiment) -> Iterator[Point]:
     if experiment.sweep is None:
         return
     for kind in KINDS:
-        values = getattr(experiment.sweep, kind)
+        values = getattr(experiment.sweep, kind) or ()
         curves = _curves(experiment, kind, values)
         for k, value in enumerate(values):
             at = experiment.model_copy(

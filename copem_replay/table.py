@@ -25,7 +25,11 @@ def summary_text(summary: pd.DataFrame) -> str:
         lines.append(
             f"ttd_rmst_s: mean time to detection, never detected counting as {_cell(float(horizon.iloc[0]))} s"
         )
-    if "pass_share" in summary:
+    if "conflict_detected_share" in summary:
+        names = [name for name in summary if name.startswith("conflict_")]
+        lines += ["", as_text(summary[["configuration", *names]])]
+        lines.append("conflict_*: the same of the first list that implies a collision")
+    if "pass_share" in summary and summary["n_conflict"].any():
         verdicts = summary.assign(**{"95 %": _intervals(summary, "pass_share")})
         exact = ["pass_share_exact"] if "pass_share_exact" in summary else []
         lines += ["", as_text(verdicts[["configuration", "n_conflict", "pass_share", "95 %", *exact]])]
@@ -66,4 +70,6 @@ def as_text(table: pd.DataFrame) -> str:
 def _cell(value: object) -> str:
     if value is None or value is pd.NA or value != value:
         return "–"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return "0" if abs(value) < 1e-12 else f"{value:.4g}"

@@ -1226,3 +1226,17 @@ def test_who_brakes_earlier_is_never_farther_where_the_ego_slowed_down() -> None
     (early, late), _ = braked(encounter, ConstantDeceleration(a_max_mps2=2.0), np.array([1.0, 2.0]))
     assert late[-1] == pytest.approx(17.0, abs=0.05), "from 16 m at 2 m/s"
     assert early[-1] <= late[-1] + 1e-6
+
+
+@pytest.mark.parametrize(("back_m", "meets"), [(0.0, False), (0.25, False), (1.9, False), (2.1, True)])
+def test_noise_of_a_place_is_no_reversing(back_m: float, meets: bool) -> None:
+    """It stops after 12.5 m; its last place is a little back. At constant speed from the onset on, 10 m/s, it goes on
+    ahead, not back into the one who stands 15 m behind it; only who goes back by 2 m is in reverse."""
+
+    def stops(t: float) -> tuple[float, float]:
+        return Drive(10, slows_s=0.0, deceleration=4.0).at(t)[0] - (back_m if t > 3.95 else 0.0), 0.0
+
+    things = [Thing("ego", "car", stops), Thing("behind", "pedestrian", standing(-15, 0))]
+    log = recording(things, until_s=6.0)
+    wanted = plan(ego="constant_speed", measure={"onset": {"kind": "appears"}})
+    assert (meeting(log, wanted) is not None) == meets

@@ -541,7 +541,7 @@ class TestRefused:
         }
         both = {"PEM": {"units": ["ego"]}, "both": {"units": "all"}}
         line = refused(masts(1, units=units, configurations=both, measure=TWO_OF_TWO), one_walker())
-        assert line.startswith("scene: measure.exact: configuration both: unit ego does not list at every instant")
+        assert line.startswith("scene: exact: configuration both: unit ego does not list at every instant")
         alone = masts(1, units=units, configurations={"PEM": both["PEM"]}, measure=TWO_OF_TWO)
         assert run(alone, [one_walker()]).exact is not None
         once = masts(1, units=units, configurations=both)
@@ -561,7 +561,7 @@ class TestRefused:
     def test_different_latencies(self, latency: dict[str, float]) -> None:
         late = {"late": {"units": "all", "latency_s": latency}}
         line = refused(masts(2, configurations=late, measure=TWO_OF_TWO), one_walker())
-        assert line.startswith("scene: measure.exact: configuration late: lists captured together arrive up to ")
+        assert line.startswith("scene: exact: configuration late: lists captured together arrive up to ")
         assert run(masts(2, configurations=late), [one_walker()]).exact is not None
         alike = {"late": {"units": "all", "latency_s": {"m0": 0.1, "default": 0.1}}}
         assert run(masts(2, configurations=alike, measure=TWO_OF_TWO), [one_walker()]).exact is not None
@@ -574,11 +574,15 @@ class TestRefused:
             ("of: 1000", []),
             (
                 "hits: 2, of: 13",
-                ["17: measure.confirm.of: exact: expected `of` at most 12 (2 to the power of `of` states), found 13"],
+                [
+                    "17: measure.confirm.of: for `exact` expected `of` at most 12 (2 to the power of `of` states), found 13"
+                ],
             ),
             (
                 "hits: 13, of: 1000",
-                ["17: measure.confirm.of: exact: expected `of` at most 12 (2 to the power of `of` states), found 1000"],
+                [
+                    "17: measure.confirm.of: for `exact` expected `of` at most 12 (2 to the power of `of` states), found 1000"
+                ],
             ),
         ],
     )
@@ -591,7 +595,7 @@ class TestRefused:
         braking = "braking: {driver: {kind: constant_deceleration, a_max_mps2: 8}, brakes_for: %s}"
         measure = "measure: {conflict: {horizon_s: 3}, exact: true}"
         assert checked(tmp_path, measure, braking % "conflict") == [
-            "17: measure.exact: exact: perceived conflicts depend on sampled errors and have no closed form; "
+            "17: measure.exact: perceived conflicts depend on sampled errors and have no closed form; "
             "use `brakes_for: object`"
         ]
         assert checked(tmp_path, measure, braking % "object") == []

@@ -764,7 +764,7 @@ FLEET = "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}"
         (
             [FLEET, "measure: {confirm: {hits: 2, of: 3}, exact: true}"],
             [
-                "17: measure.exact: exact: unit 'mast' is only in some runs, and confirmation by several hits then has "
+                "17: measure.exact: unit 'mast' is only in some runs, and confirmation by several hits then has "
                 "no closed form; confirm with one hit"
             ],
         ),

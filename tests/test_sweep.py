@@ -475,7 +475,7 @@ class TestCheck:
                     "19: sweep.units[3]: expected at most 1, the units beside the ego's; found 7",
                 ],
             ),
-            (["sweep: {share: [0.5]}"], ["19: sweep.share: share: no unit is `on: {classes, share}`"]),
+            (["sweep: {share: [0.5]}"], ["19: sweep.share: no unit is `on: {classes, share}`"]),
             (["  mast: {on: {classes: [car], share: 1}, pem: onboard}", "sweep: {share: [0.5]}"], []),
             (
                 ["sweep: {}"],
@@ -486,10 +486,18 @@ class TestCheck:
             ),
             (
                 ["sweep: {configurations: [PEM], latency_s: []}"],
+                ["19: sweep.latency_s: expected at least 1 in the list, found []"],
+            ),
+            (
+                ["sweep: {configurations: [PEM]}"],
                 [
                     "19: sweep: expected values of latency_s, rate_hz, units or share, such as "
                     "`latency_s: [0, 0.5, 1]`"
                 ],
+            ),
+            (
+                ["sweep: {rate_hz: [20, 10, 10]}"],
+                ["19: sweep.rate_hz: expected each value once, found 10 twice"],
             ),
             (
                 ["sweep: {configurations: [], latency_s: [0]}"],
@@ -502,7 +510,7 @@ class TestCheck:
                 [
                     "19: sweep.share[0]: expected at most 1, found 2",
                     "19: sweep.configurations[0]: no configuration is named 'x'; there are GT, PEM, coPEM",
-                    "19: sweep.share: share: no unit is `on: {classes, share}`",
+                    "19: sweep.share: no unit is `on: {classes, share}`",
                     "19: sweep.units[0]: expected at most 1, the units beside the ego's; found 5",
                 ],
             ),
@@ -515,7 +523,7 @@ class TestCheck:
         text = (
             "version: 1\nlogs: [drive.mcap]\nconfigurations: {GT: {units: truth}}\nsweep: {rate_hz: [5], units: [0]}\n"
         )
-        assert checked(tmp_path, text) == ["4: sweep.rate_hz: rate_hz: the experiment has no units"]
+        assert checked(tmp_path, text) == ["4: sweep.rate_hz: the experiment has no units"]
 
     def test_our_own_experiments(self) -> None:
         for name in ("tc016d_beyond", "crossing_share"):

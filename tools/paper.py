@@ -43,7 +43,13 @@ def beside(summary: pd.DataFrame) -> pd.DataFrame:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Our success table beside the paper's.")
     parser.add_argument("folder", type=Path, help="results of logs/tc016d.yaml")
-    summary = pd.read_csv(parser.parse_args().folder / "summary.csv")
+    folder = parser.parse_args().folder
+    try:
+        summary = pd.read_csv(folder / "summary.csv")
+    except OSError as error:
+        parser.error(f"{folder}: expected a results folder: {error.strerror}")
+    if not set(PASSED) <= set(summary["configuration"]) or "pass_share_exact" not in summary:
+        parser.error(f"{folder}: expected the results of logs/tc016d.yaml")
     print("Success rates beside the paper's (calibrated to them: docs/calibration.md)")
     print(as_text(beside(summary)))
 

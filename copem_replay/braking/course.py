@@ -1,7 +1,8 @@
 """The ego's course: the path it takes through the log, and how it drives along it.
 
 The path is what matters of its recorded places: those at least `STRIDE_M` apart, so that what a standing vehicle's
-place jitters by is no way. It goes straight on ahead where the recording ends (backwards where the ego last went so).
+place jitters by is no way, and it turns back only where the ego goes back by `REVERSAL_M`. It goes straight on ahead
+where the recording ends (backwards where the ego was in reverse).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
 
 STRIDE_M = 0.1
 """Places of the path are at least this far apart (chosen: more than a standing vehicle jitters)."""
+REVERSAL_M = 2.0
+"""Going back by this much is reversing, by less the noise of a place (chosen)."""
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
@@ -47,8 +50,9 @@ class EgoCourse:
         x, y, yaw = truth.x_m[0, rows], truth.y_m[0, rows], np.unwrap(truth.yaw_rad[0, rows])
         self.frame_s = truth.row_captured_s[rows]
         self.frame_mps = np.hypot(truth.vx_mps[0, rows], truth.vy_mps[0, rows])
-        vertex = _vertices(x, y, STRIDE_M)
-        self.path = _with_end(np.stack([_arc(x[vertex], y[vertex]), x[vertex], y[vertex], yaw[vertex]], axis=1))
+        vertex, backwards = _vertices(x, y, yaw, STRIDE_M, REVERSAL_M)
+        places = np.stack([_arc(x[vertex], y[vertex]), x[vertex], y[vertex], yaw[vertex]], axis=1)
+        self.path = _with_end(places, backwards)
         self.frame_m = _along(x, y, vertex, self.path)
         self.size_m = np.array([truth.length_m[0, rows[0]], truth.width_m[0, rows[0]]])
 
@@ -76,13 +80,11 @@ def _arc(x_m: Float, y_m: Float) -> Float:
     return np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
 
 
-def _with_end(path: Float) -> Float:
-    """The path (V, 4) and one more vertex a metre on: ahead, or behind where the ego last went backwards."""
+def _with_end(path: Float, backwards: bool) -> Float:
+    """The path (V, 4) and one more vertex a metre on: ahead, or behind where the ego was in reverse."""
     _, x, y, yaw = path[-1]
-    ahead = np.array([np.cos(yaw), np.sin(yaw)])
-    backwards = len(path) > 1 and (path[-1, 1:3] - path[-2, 1:3]) @ ahead < 0
-    end = np.array([x, y]) + (-ahead if backwards else ahead)
-    return np.vstack([path, [path[-1, 0] + 1.0, *end, yaw]])
+    ahead = np.array([np.cos(yaw), np.sin(yaw)]) * (-1 if backwards else 1)
+    return np.vstack([path, [path[-1, 0] + 1.0, x + ahead[0], y + ahead[1], yaw]])
 
 
 def _along(x_m: Float, y_m: Float, vertex: Int, path: Float) -> Float:
@@ -95,14 +97,20 @@ def _along(x_m: Float, y_m: Float, vertex: Int, path: Float) -> Float:
 
 
 @nb.njit(cache=True)
-def _vertices(x_m: Float, y_m: Float, stride_m: float) -> Int:
-    """Indices (V,) of the first place and of each that is at least a stride away from the one before."""
+def _vertices(x_m: Float, y_m: Float, yaw_rad: Float, stride_m: float, reversal_m: float) -> tuple[Int, bool]:
+    """Indices (V,) of the places that make the path, and whether it ends in reverse.
+
+    The first one, and each that is a stride away from the one before in the direction the ego goes, or a reversal away
+    against it; then it goes that way.
+    """
     kept = np.empty(len(x_m), dtype=np.int64)
     kept[0] = 0
-    n = 1
+    n, backwards = 1, False
     for k in range(1, len(x_m)):
-        last = kept[n - 1]
-        if np.hypot(x_m[k] - x_m[last], y_m[k] - y_m[last]) >= stride_m:
+        dx, dy = x_m[k] - x_m[kept[n - 1]], y_m[k] - y_m[kept[n - 1]]
+        against = (dx * np.cos(yaw_rad[k]) + dy * np.sin(yaw_rad[k]) < 0) != backwards
+        if np.hypot(dx, dy) >= (reversal_m if against else stride_m):
             kept[n] = k
             n += 1
-    return kept[:n].copy()
+            backwards = backwards != against
+    return kept[:n].copy(), backwards

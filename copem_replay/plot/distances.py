@@ -44,7 +44,12 @@ def distances_figure(results: Results, *, configurations: Sequence[str] | None =
         figure = new_figure(1.6 + 4.4 * len(columns) + 0.6, 1.5 + 0.5 * len(names))
         panels = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]
         looks = appearances(tuple(results.experiment.configurations))
-        lost = sum(_panel(axes, table, column, names, looks) for axes, column in zip(panels, columns, strict=True))
+        braking = results.experiment.braking
+        braked_for = _CONFLICT if braking is not None and braking.brakes_for == "conflict" else _OBJECT
+        lost = sum(
+            _panel(axes, table, column, names, looks, "conflict" in table and column == braked_for)
+            for axes, column in zip(panels, columns, strict=True)
+        )
         _strips(panels, names, table)
         shown = [kind for kind in (PASS, FAIL, NEUTRAL) if (verdicts(table) == kind).any()]
         if "conflict" in table and len(shown):
@@ -86,7 +91,9 @@ def spread(distance_m: Float, verdict: Sequence[str], width_m: float) -> Float:
     return result
 
 
-def _panel(axes: Axes, table: pd.DataFrame, column: str, names: Sequence[str], looks: dict[str, Appearance]) -> int:
+def _panel(
+    axes: Axes, table: pd.DataFrame, column: str, names: Sequence[str], looks: dict[str, Appearance], judged: bool
+) -> int:
     """Draw one panel; returns how many rows were known of but have no distance."""
     top_m = float(np.nanmax(table[[c for c in _WORDS if c in table]].to_numpy(dtype=float), initial=1.0))
     lost = 0
@@ -96,9 +103,10 @@ def _panel(axes: Axes, table: pd.DataFrame, column: str, names: Sequence[str], l
         distance_m = rows[column].to_numpy(dtype=float)
         placed = known & ~np.isnan(distance_m)
         lost += int((known & ~placed).sum())
-        kind = verdicts(rows).to_numpy()
+        # Who brakes for the one event has nothing to show at the distance of the other.
+        kind = verdicts(rows).to_numpy() if judged else np.full(len(rows), NEUTRAL, dtype=object)
         across = k - _HALF * spread(distance_m[placed], list(kind[placed]), top_m / _BINS)
-        _points(axes, distance_m[placed], across, kind[placed], looks[name], name, len(table), "conflict" in table)
+        _points(axes, distance_m[placed], across, kind[placed], looks[name], name, len(table), judged)
         never = int((~known).sum())
         axes.text(-0.07 * top_m, k, f"{never}", ha="center", va="center_baseline", color=INK if never else "0.6")
     axes.axvspan(-0.14 * top_m, 0, color="0.95", zorder=0)

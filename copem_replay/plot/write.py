@@ -79,9 +79,14 @@ def write_figures(
 def _save(figure: Figure, stem: Path) -> None:
     with style(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")  # of a name; drawn as a box
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once: all files show the same
+        for axes in figure.axes:
+            # The last bits of a layout are not the same on every call, and names within an SVG are made of them.
+            left, bottom, width, height = (round(float(v), 6) for v in axes.get_position().bounds)
+            axes.set_position((left, bottom, width, height))
         for suffix, metadata in _METADATA.items():
             figure.savefig(stem.with_suffix(suffix), metadata=metadata)
-            figure.set_layout_engine("none")  # laid out once: the next file shows the same
 
 
 @contextmanager
