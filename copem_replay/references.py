@@ -52,7 +52,7 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
     if measure.get("exact") is True and isinstance(confirm, dict):
         of = confirm.get("of", 1)
         if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
-            message = f"for `exact` expected `of` at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
+            message = f"for `exact` expected at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
             yield source.at(("measure", "confirm", "of"), message)
     if data.get("ego") == NO_EGO:
         for key in (("braking",), ("measure", "conflict")):

@@ -147,8 +147,9 @@ def _notes(replay: Replay, experiment: Experiment) -> list[str]:
     if experiment.braking is not None and len(replay.looks.object_ix) and not replay.encounters:
         how = "as recorded" if experiment.braking.ego == "recorded" else "at constant speed"
         notes.append(
-            f"no verdict: the ego, not braking ({how}), stays more than {experiment.braking.margin_m:g} m from all that "
-            "is measured" + ("; `ego: constant_speed` asks what if nobody had braked" if how == "as recorded" else "")
+            f"no verdict: the ego, not braking ({how}), stays more than {experiment.braking.margin_m:g} m from all "
+            "that is measured"
+            + ("; `ego: constant_speed` asks what if nobody had braked" if how == "as recorded" else "")
         )
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.fleet.named:

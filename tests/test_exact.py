@@ -574,15 +574,11 @@ class TestRefused:
             ("of: 1000", []),
             (
                 "hits: 2, of: 13",
-                [
-                    "17: measure.confirm.of: for `exact` expected `of` at most 12 (2 to the power of `of` states), found 13"
-                ],
+                ["17: measure.confirm.of: for `exact` expected at most 12 (2 to the power of `of` states), found 13"],
             ),
             (
                 "hits: 13, of: 1000",
-                [
-                    "17: measure.confirm.of: for `exact` expected `of` at most 12 (2 to the power of `of` states), found 1000"
-                ],
+                ["17: measure.confirm.of: for `exact` expected at most 12 (2 to the power of `of` states), found 1000"],
             ),
         ],
     )
