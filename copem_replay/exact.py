@@ -66,12 +66,15 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[tup
     listed = np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else replay.measured.probability
     instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
     arrives_s = heard.arrives_s[0, heard.frame_ix]
+    by_object = np.argsort(heard.row_object_ix, kind="stable")
+    first, last = (np.searchsorted(heard.row_object_ix[by_object], looks.object_ix, side) for side in ("left", "right"))
     result = []
-    for m, object_ix in enumerate(looks.object_ix):
-        counts = (heard.row_object_ix == object_ix) & (arrives_s <= looks.ended_s[m] + _TOLERANCE_S)
+    for m in range(len(looks.object_ix)):
+        rows = by_object[first[m] : last[m]]
+        counts = arrives_s[rows] <= looks.ended_s[m] + _TOLERANCE_S
         if not experiment.measure.count_earlier:
-            counts &= heard.row_captured_s >= looks.onset_s[m] - _TOLERANCE_S
-        rows = np.flatnonzero(counts)
+            counts &= heard.row_captured_s[rows] >= looks.onset_s[m] - _TOLERANCE_S
+        rows = rows[counts]
         if instants is None:
             share = replay.fleet.share if configuration.units != TRUTH else np.ones(1)
             result.append(_first_of(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share))

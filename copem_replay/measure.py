@@ -99,13 +99,12 @@ def _columns(
     }
     if known.foreseen_s is not None:
         foreseen_s = flat(known.foreseen_s)
+        away_m, _ = distances(scene, truth, experiment, flat(found.object_ix), foreseen_s)
         columns |= {
             "conflict_detected": ~np.isnan(foreseen_s),
             "conflict_detection_s": foreseen_s,
             "time_to_conflict_detection_s": foreseen_s - onset_s,
-            "distance_at_conflict_detection_m": distances(scene, truth, experiment, flat(found.object_ix), foreseen_s)[
-                0
-            ],
+            "distance_at_conflict_detection_m": away_m,
         }
     return columns
 

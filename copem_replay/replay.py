@@ -54,6 +54,11 @@ class Replay:
     encounters: tuple[Encounter, ...]  # those in conflict
 
     @cached_property
+    def ego(self) -> EgoCourse:
+        """How the ego drives through the log. There has to be one."""
+        return EgoCourse(self.scene, self.truth, self.fleet.experiment.max_gap_s)
+
+    @cached_property
     def passing_s(self) -> dict[int, Float]:
         """For each look in conflict the beginnings of braking (K, 2), from and to, with which the ego passes."""
         braking = self.fleet.experiment.braking
@@ -131,7 +136,7 @@ def _foreseen(replay: Replay, belief: Belief, experiment: Experiment) -> Float:
     assert measure.conflict is not None
     return foreseen(
         belief,
-        EgoCourse(replay.scene, replay.truth, experiment.max_gap_s),
+        replay.ego,
         replay.looks,
         measure.conflict,
         confirm=measure.confirm,

@@ -30,7 +30,7 @@ from copem_replay.run import Result, log_path_of, shown_logs, shown_run
 
 _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
-    "shapely",
+    "scipy", "shapely",
 )  # fmt: skip
 _MARK = "provenance.json"
 _EXPERIMENT = "experiment.yaml"

@@ -49,12 +49,13 @@ def summary(
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and what has to be said about them. `exact`: the rows of `exact.parquet`."""
     notes: list[str] = []
-    over, _ = clusters(table)
-    if over is None and len(table):
-        notes.append(
-            f"no interval of the detected share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-            "measured objects, and more runs do not tell about other traffic"
-        )
+    judged = table[table["conflict"]] if "conflict" in table else table.iloc[:0]
+    for what, rows_of, whom in (("detected", table, "measured objects"), ("pass", judged, "objects in conflict")):
+        if len(rows_of) and clusters(rows_of)[0] is None:
+            notes.append(
+                f"no interval of the {what} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
+                f"{whom}, and more runs do not tell about other traffic"
+            )
     parts = _by_configuration(table)
     exactly = _by_configuration(exact) if exact is not None else {}
     rows = []

@@ -35,6 +35,7 @@ from copem_replay.errors import InputError
 from copem_replay.experiment import Experiment
 from copem_replay.read import Recording
 from copem_replay.replay import prepare, replay_block
+from copem_replay.run import run
 from copem_replay.tracks import Float
 from scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 
@@ -1240,3 +1241,11 @@ def test_noise_of_a_place_is_no_reversing(back_m: float, meets: bool) -> None:
     log = recording(things, until_s=6.0)
     wanted = plan(ego="constant_speed", measure={"onset": {"kind": "appears"}})
     assert (meeting(log, wanted) is not None) == meets
+
+
+def test_two_in_conflict_have_no_interval_and_it_is_said() -> None:
+    """Two stand in the way, one behind the other: too few to resample, and their runs are no other traffic."""
+    things = [straight_ego(), *(Thing(name, "pedestrian", standing(x, 0)) for name, x in (("a", 20), ("b", 25)))]
+    result = run(plan(runs=3), [recording(things, until_s=4.0)])
+    assert result.summary["pass_interval"].isna().all()
+    assert any("no interval of the pass share: fewer than 5 logs and fewer than 5 objects" in n for n in result.notes)

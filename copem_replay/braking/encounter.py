@@ -47,8 +47,10 @@ def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: Experiment
         return ()
     ego = EgoCourse(scene, truth, experiment.max_gap_s)
     result = []
+    track_of = {int(object_ix): track for track, object_ix in enumerate(truth.object_ix)}
     for k, object_ix in enumerate(found.object_ix):
-        rows = np.flatnonzero(truth.row_object_ix == object_ix)
+        track = track_of[int(object_ix)]
+        rows = np.arange(truth.start[track], truth.start[track + 1])
         onset_s = float(found.onset_s[k])
         constant_from_s = onset_s if braking.ego == "constant_speed" else None
         if _may_meet(ego, truth, rows, onset_s, constant_from_s, braking.margin_m):
