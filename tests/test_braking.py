@@ -910,9 +910,9 @@ def test_one_reaction_for_all_configurations_and_in_any_batch() -> None:
     delay_s = (batch["brake_s"] - batch["detection_s"]).to_numpy().reshape(3, 40)
     np.testing.assert_allclose(delay_s[1:], delay_s[[0, 0]], atol=1e-9)
     assert len(np.unique(np.round(delay_s[0], 9))) == 40, "another one in every run"
-    for run in (0, 17):
-        alone = replay_block(ready, wanted, np.array([run]))
-        pd.testing.assert_frame_equal(alone, batch[batch["run"] == run].reset_index(drop=True))
+    for number in (0, 17):
+        alone = replay_block(ready, wanted, np.array([number]))
+        pd.testing.assert_frame_equal(alone, batch[batch["run"] == number].reset_index(drop=True))
     # Another configuration, another unit, another object: the delays are what they were.
     fewer = plan(driver=GAMMA, runs=40)
     found = rows(in_the_way(30), fewer, 40)
