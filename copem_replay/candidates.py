@@ -14,7 +14,7 @@ from copem_replay.pem.condition import applies
 from copem_replay.pem.detection import probability_of
 from copem_replay.pem.look import Look
 from copem_replay.resample import at_instants, wrap
-from copem_replay.tracks import VALUES, Float, Int, Scene, Tracks
+from copem_replay.tracks import VALUES, Float, Int, Scene, Tracks, joined
 from copem_replay.units import (
     Poses,
     carrier,
@@ -31,7 +31,8 @@ from copem_replay.visibility import Statics, visible_shares
 class Candidates:
     """True states of all candidate rows (one run), how they look, and with which probability they are listed.
 
-    `couple_ix (P,)`: the couple of the unit's PEM that applies, −1: none. `probability (P,)`.
+    `couple_ix (P,)`: the couple of the unit's PEM that applies, −1: none. `probability (P,)`, and `existence (P,)` as
+    the unit claims it of what it lists.
     `poses` and the lists of each unit are in the experiment's order.
     """
 
@@ -39,6 +40,7 @@ class Candidates:
     look: Look
     couple_ix: Int
     probability: Float
+    existence: Float
     poses: dict[str, Poses]
     static: Statics
     notes: tuple[str, ...]
@@ -53,6 +55,7 @@ class Candidates:
             look=self.look.take(rows),
             couple_ix=self.couple_ix[rows],
             probability=self.probability[rows],
+            existence=self.existence[rows],
         )
 
 
@@ -61,7 +64,7 @@ def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidate
     notes: list[str] = []
     static = place_obstacles(truth, experiment.obstacles, notes)
     worlds: dict[bytes, tuple[Tracks, list[str]]] = {}
-    for name, unit in experiment.units.items():
+    for name, unit in experiment.modelled.items():
         stamps = list_instants(scene, truth, unit)
         if stamps.tobytes() not in worlds:
             world = truth if unit.rate_hz is None else _world(scene, truth, stamps, experiment.max_gap_s)
@@ -83,8 +86,8 @@ def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidate
         )
         for k, name in enumerate(names):
             pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
-    ordered = [pieces[name] for name in experiment.units]
-    tracks = _joined(tuple(experiment.units), [piece[0] for piece in ordered])
+    ordered = [pieces[name] for name in experiment.modelled]
+    tracks = joined(tuple(experiment.modelled), [piece[0] for piece in ordered])
     look = Look(
         **{
             name: np.concatenate([np.empty(0), *(getattr(piece[1], name) for piece in ordered)])
@@ -92,13 +95,13 @@ def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidate
         }
     )
     look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
-    couple_ix, probability = _assess(tracks, look, experiment)
-    for k, name in enumerate(experiment.units):
+    couple_ix, probability, existence = _assess(tracks, look, experiment)
+    for k, name in enumerate(experiment.modelled):
         if not (tracks.frame_unit_ix == k).any():
             notes.append(f"unit {name}: makes no list, its carrier is never there")
         elif not (couple_ix[tracks.row_unit_ix == k] >= 0).any():
             notes.append(f"unit {name}: no object ever meets a condition of its PEM {experiment.units[name].pem!r}")
-    return Candidates(tracks, look, couple_ix, probability, unit_poses, static, tuple(notes))
+    return Candidates(tracks, look, couple_ix, probability, existence, unit_poses, static, tuple(notes))
 
 
 def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float) -> Tracks:
@@ -143,43 +146,20 @@ def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple
     return tracks, look
 
 
-def _joined(units: tuple[str, ...], pieces: list[Tracks]) -> Tracks:
-    """Tracks of several units, each with its own lists, as one."""
-    none = np.empty(0, dtype=np.int64)
-    row_offset = np.concatenate([[0], np.cumsum([len(p.frame_ix) for p in pieces])]).astype(np.int64)
-    frame_offset = np.concatenate([[0], np.cumsum([len(p.stamp_ns) for p in pieces])]).astype(np.int64)
-
-    def rows(name: str) -> Float:
-        return np.concatenate([np.empty((1, 0)), *(getattr(p, name) for p in pieces)], axis=1)
-
-    captured_s = np.concatenate([np.empty(0), *(p.captured_s for p in pieces)])
-    return Tracks(
-        units=units,
-        start=np.concatenate([[0], *(p.start[1:] + row_offset[k] for k, p in enumerate(pieces))]),
-        unit_ix=np.concatenate([none, *(np.full(len(p.unit_ix), k) for k, p in enumerate(pieces))]),
-        object_ix=np.concatenate([none, *(p.object_ix for p in pieces)]),
-        frame_ix=np.concatenate([none, *(p.frame_ix + frame_offset[k] for k, p in enumerate(pieces))]),
-        stamp_ns=np.concatenate([none, *(p.stamp_ns for p in pieces)]),
-        captured_s=captured_s,
-        frame_unit_ix=np.concatenate([none, *(np.full(len(p.stamp_ns), k) for k, p in enumerate(pieces))]),
-        arrives_s=captured_s[None],
-        valid=rows("valid").astype(bool),
-        **{name: rows(name) for name in VALUES},
-    )
-
-
-def _assess(tracks: Tracks, look: Look, experiment: Experiment) -> tuple[Int, Float]:
-    """Which couple of its unit's PEM applies to each row, and the probability it gives."""
+def _assess(tracks: Tracks, look: Look, experiment: Experiment) -> tuple[Int, Float, Float]:
+    """Which couple of its unit's PEM applies to each row, the probability it gives, and the existence it claims."""
     couple_ix = np.full(len(tracks.frame_ix), -1)
-    probability = np.zeros(len(tracks.frame_ix))
-    for k, unit in enumerate(experiment.units.values()):
+    probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
+    for k, unit in enumerate(experiment.modelled.values()):
         rows = np.flatnonzero(tracks.row_unit_ix == k)
         seen = look.take(rows)
-        pem = experiment.pems[unit.pem]
+        pem = experiment.pems[str(unit.pem)]
         couple_ix[rows] = applies(pem, seen)
         for c, couple in enumerate(pem):
             mine = rows[couple_ix[rows] == c]
             if len(mine):
                 where = f"pems.{unit.pem}[{c}].detection"
                 probability[mine] = probability_of(couple.detection, look.take(mine), where)
-    return couple_ix, probability
+                claimed = couple.existence
+                existence[mine] = look.visible_share[mine] if claimed == "visible_share" else claimed
+    return couple_ix, probability, existence

@@ -12,6 +12,7 @@ from copem_replay.experiment import Carriers, Experiment
 from copem_replay.experiment_file import Source, is_there, log_paths, parse
 from copem_replay.plain_yaml import Key
 from copem_replay.read import Recording, moving_ids, read
+from copem_replay.recorded import recorded_unit
 from copem_replay.references import NO_EGO, references, unknown
 
 
@@ -91,17 +92,27 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
         return None, [Refused(path, "its path is not UTF-8: results could not name it")]
     ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
     wrong: list[Refused] = []
+    beside = {asked.topic for asked in experiment.recorded.values()}
     try:
-        recording = read(path, name=path.stem, ego=ego, topic=experiment.read.topic)
+        recording = read(path, name=path.stem, ego=ego, topic=experiment.read.topic, beside=beside)
     except RecordingError as error:
         reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
         if not reasons[0].startswith("ego: "):
             key = ("read", "topic") if "no true objects on topic" in reasons[0] else None
             return None, [Refused(path, reason, key) for reason in reasons]
         wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
-        recording = read(path, name=path.stem, topic=experiment.read.topic)  # for what else is wrong
+        recording = read(path, name=path.stem, topic=experiment.read.topic, beside=beside)  # for what else is wrong
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
+    lists, notes = {}, list(recording.notes)
+    for name, asked in experiment.recorded.items():
+        try:
+            lists[name], said = recorded_unit(path, recording.scene, name, asked)
+            notes += said
+        except RecordingError as error:
+            at = ("units", name, "recorded")
+            wrong += [Refused(path, line.removeprefix(f"{path}: "), at) for line in error.problems]
+    recording = replace(recording, lists=lists, notes=tuple(notes))
     return recording, wrong + [Refused(path, reason, key) for key, reason in against_log(experiment, recording, wrong)]
 
 

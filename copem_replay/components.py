@@ -17,10 +17,12 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    WithJsonSchema,
 )
 from pydantic_core import PydanticCustomError, core_schema
 
@@ -65,14 +67,24 @@ Flag = Annotated[bool, Field(strict=True)]
 """True or false; `yes` is text."""
 
 
+def _identifier(value: object) -> object:
+    """Ids may be numbers or text: `1` is `"1"`."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Id = Annotated[str, BeforeValidator(_identifier), WithJsonSchema({"type": ["string", "integer"]})]
+
+
 class Slot:
     """Annotation of a field that holds a component: `Annotated[DetectionModel, Slot("detection", {...})]`.
 
-    `built_in` maps names to `package.module:Class`, so that nothing is imported before it is used.
+    `built_in` maps names to `package.module:Class`, so that nothing is imported before it is used. `default`: the kind
+    where none is said.
     """
 
-    def __init__(self, name: str, built_in: Mapping[str, str]) -> None:
+    def __init__(self, name: str, built_in: Mapping[str, str], default: str | None = None) -> None:
         self.name = name
+        self.default = default
         self.built_in = dict(built_in)
         self.base: type[Any] = Component
 
@@ -98,7 +110,8 @@ class Slot:
                 continue
             found = deepcopy(handler.resolve_ref_schema(handler(component.__pydantic_core_schema__)))
             found["properties"]["kind"] = {"const": kind}
-            found["required"] = sorted({*found.get("required", []), "kind"})
+            if kind != self.default:
+                found["required"] = sorted({*found.get("required", []), "kind"})
             alternatives.append(found)
         own = {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]}
         return {"anyOf": [*alternatives, own]}
@@ -139,6 +152,8 @@ class Slot:
         """A component from what the experiment says of it."""
         if isinstance(value, Component):
             return value
+        if self.default is not None and isinstance(value, Mapping) and "kind" not in value:
+            value = {"kind": self.default, **value}
         if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
             found = "nothing" if value is None else repr(value)
             raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {found}")
@@ -150,4 +165,4 @@ def _problem(message: str) -> PydanticCustomError:
     return PydanticCustomError("component", "{message}", {"message": message})
 
 
-__all__ = ["Component", "Count", "Flag", "Frozen", "NotNegative", "Number", "Positive", "Share", "Slot"]
+__all__ = ["Component", "Count", "Flag", "Frozen", "Id", "NotNegative", "Number", "Positive", "Share", "Slot"]

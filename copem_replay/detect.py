@@ -10,12 +10,13 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba as nb
 import numpy as np
 
-from copem_replay.experiment import Confirm
+from copem_replay.fusion.instants import outrun
+from copem_replay.measure_keys import Confirm
 from copem_replay.onset import Looks
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 
@@ -36,6 +37,7 @@ def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool
 
     `max_age_s` counts from capture, on top of a list's own way to the receiver.
     """
+    heard = replace(heard, arrives_s=np.where(outrun(heard), np.inf, heard.arrives_s))
     arrives_s = heard.arrives_s[0, heard.frame_ix]
     captured_s = heard.row_captured_s
     order, bounds = _by_object(heard, found, arrives_s)
@@ -61,18 +63,24 @@ def capture_instants(heard: Tracks) -> Int:
     Captures of several units within half the shortest list period of the first one are one instant; two captures of
     one unit never are.
     """
-    periods = []
     came = np.isfinite(heard.arrives_s[0])  # what never arrives is no capture to the receiver
-    for unit in np.unique(heard.frame_unit_ix[came]):
-        mine = np.flatnonzero((heard.frame_unit_ix == unit) & came)
-        if len(mine) > 1:
-            periods.append(float(np.median(np.diff(heard.captured_s[mine]))))
-    reach_s = min(periods, default=0.0) / 2 + _TOLERANCE_S
+    reach_s = shortest_period_s(heard) / 2 + _TOLERANCE_S
     order = np.flatnonzero(came)
     order = order[np.argsort(heard.captured_s[order], kind="stable")]
     cluster = np.zeros(len(came), dtype=np.int64)
     _cluster(heard.captured_s, heard.frame_unit_ix, np.full(len(heard.units), -1), reach_s, order, cluster)
     return cluster
+
+
+def shortest_period_s(heard: Tracks) -> float:
+    """The shortest of the units' list periods (each the median between two captures), 0 where there is none."""
+    periods = []
+    came = np.isfinite(heard.arrives_s[0])
+    for unit in np.unique(heard.frame_unit_ix[came]):
+        captured_s = np.sort(heard.captured_s[(heard.frame_unit_ix == unit) & came])
+        if len(captured_s) > 1:
+            periods.append(float(np.median(np.diff(captured_s))))
+    return min(periods, default=0.0)
 
 
 def _by_object(heard: Tracks, found: Looks, arrives_s: Float) -> tuple[Int, Int]:

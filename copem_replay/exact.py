@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from copem_replay.believe import listen
 from copem_replay.braking.driver import Reaction
 from copem_replay.braking.verdict import pass_probability
 from copem_replay.detect import capture_instants
@@ -22,7 +23,7 @@ from copem_replay.experiment import Experiment
 from copem_replay.fleet import fleet_of
 from copem_replay.measure import distances
 from copem_replay.onset import ENDED_BY
-from copem_replay.replay import Replay, listen
+from copem_replay.replay import Replay
 from copem_replay.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Float, Int, Tracks
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9

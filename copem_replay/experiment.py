@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from copem_replay.braking.driver import DRIVERS, Driver
-from copem_replay.components import Count, Flag, Frozen, NotNegative, Number, Positive, Share, Slot
+from copem_replay.components import Count, Frozen, Id, NotNegative, Number, Positive, Share, Slot
+from copem_replay.fusion import FUSIONS
+from copem_replay.fusion.component import Fusion, Ideal
+from copem_replay.measure_keys import Margin, Measure
 from copem_replay.pem.condition import ClassNames, Pem
-
-
-def _identifier(value: object) -> object:
-    """Ids may be numbers or text: `1` is `"1"`."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+from copem_replay.pem.error import Covariance
 
 
 def _unit_name(value: str) -> str:
@@ -39,7 +38,6 @@ def _configuration_name(value: str) -> str:
     return value
 
 
-Id = Annotated[str, BeforeValidator(_identifier), WithJsonSchema({"type": ["string", "integer"]})]
 UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 Point = tuple[Number, Number]
@@ -65,10 +63,24 @@ def _what_carries(value: object) -> str:
 On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], Discriminator(_what_carries)]
 
 
+class Recorded(Frozen):
+    """Lists as they were recorded in the log, on a topic of osi3.SensorData, instead of a PEM.
+
+    `delay_s`: how long before its stamp a list was captured, where its messages don't say; `covariance_m2` of its
+    positions and `existence` of its entries likewise.
+    """
+
+    topic: Annotated[str, Field(min_length=1)]
+    delay_s: Latency = 0.0
+    covariance_m2: Covariance | None = None
+    existence: Share = 0.9
+
+
 class Unit(Frozen):
     """A perception unit: carried `on` the ego, another object or a share of some classes, or standing `at` a place.
 
-    `height_m` above the ground; left out, a carried unit is on the roof.
+    `height_m` above the ground; left out, a carried unit is on the roof. One whose lists are `recorded` has no PEM, and
+    needs a place only where distances are measured from it.
     """
 
     on: On | None = None
@@ -77,12 +89,19 @@ class Unit(Frozen):
     yaw_deg: Number = 0.0
     height_m: NotNegative | None = None
     ground_z_m: Number | None = None
-    pem: Id
+    pem: Id | None = None
+    recorded: Recorded | None = None
     rate_hz: Rate | None = None
     phase_s: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _place(self) -> Self:
+        if (self.pem is None) == (self.recorded is None):
+            raise ValueError("expected one of `pem: <name>` and `recorded: {topic: …}`")
+        if self.recorded is not None:
+            if self.rate_hz is not None or isinstance(self.on, Carriers) or (self.on and self.at):
+                raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
+            return self
         if (self.on is None) == (self.at is None):
             raise ValueError("expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`")
         if self.height_m is None and self.at is not None:
@@ -111,22 +130,11 @@ class Obstacle(Frozen):
         return self
 
 
-class Ideal(Frozen):
-    """The paper's Ideal Fusion Model: matching by truth id, inverse-variance combination.
-
-    `combine: samples` weighs the units' sampled errors (draws stay common with other configurations),
-    `combine: posterior` draws once from N(μ, Σ); both have the same law.
-    """
-
-    kind: Literal["ideal"] = "ideal"
-    combine: Literal["samples", "posterior"] = "samples"
-
-
 class Configuration(Frozen):
     """What is compared: which units, which fusion, which latency."""
 
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
-    fusion: Ideal = Ideal()
+    fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
     latency_s: Latency | dict[Id, Latency] = 0.0
     max_age_s: Positive = 1.0
 
@@ -135,105 +143,6 @@ class Configuration(Frozen):
         if isinstance(self.latency_s, dict):
             return self.latency_s.get(unit, self.latency_s.get("default", 0.0))
         return self.latency_s
-
-
-class Objects(Frozen):
-    """Which objects are measured. Neither key: all moving objects but the ego."""
-
-    classes: ClassNames | None = None
-    ids: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> Self:
-        if self.classes is not None and self.ids is not None:
-            raise ValueError("expected either classes or ids, found both")
-        return self
-
-
-class StartsMoving(Frozen):
-    """The object moves, within a distance of the ego's centre, or ahead of its front along its heading."""
-
-    kind: Literal["starts_moving"]
-    speed_mps: Positive = 0.3
-    within_m: Positive | None = None
-    from_: Annotated[Literal["centre", "front"], Field(alias="from")] = "centre"
-
-
-class Appears(Frozen):
-    """The object is in the log."""
-
-    kind: Literal["appears"]
-
-
-class InRange(Frozen):
-    """The distance to the ego is within the range."""
-
-    kind: Literal["in_range"] = "in_range"
-    range_m: Positive = 50.0
-
-
-class LineOfSight(Frozen):
-    """The ego's units see at least this share of it (`line_of_sight`), or any unit does (`line_of_sight_any`)."""
-
-    kind: Literal["line_of_sight", "line_of_sight_any"]
-    visible_share: Annotated[Share, Field(gt=0)] = 0.1
-
-
-class At(Frozen):
-    """An instant of the log."""
-
-    kind: Literal["at"]
-    time_s: NotNegative
-
-
-Onset = Annotated[StartsMoving | Appears | InRange | LineOfSight | At, Field(discriminator="kind")]
-
-
-LONGEST_CHAIN = 12
-"""More capture instants than this have no exact times (chosen: the chain has 2¹¹ states)."""
-
-Captures = Annotated[int, Field(strict=True, ge=1, le=1000)]
-
-
-class Confirm(Frozen):
-    """Detected when `hits` of the last `of` capture instants hold the object."""
-
-    hits: Captures = 1
-    of: Captures = 1
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        if self.hits > self.of:
-            raise ValueError(f"expected hits ≤ of, found {self.hits} of {self.of}")
-        return self
-
-
-Margin = Annotated[float, Field(strict=True, ge=0, le=100)]
-"""Metres, a hundred at most (chosen: more is a mistake)."""
-
-
-class Conflict(Frozen):
-    """When a perceived state implies a collision: its predicted way meets the ego's corridor within the horizon.
-
-    The corridor is what the ego, at its present speed, will sweep of its own path, and `margin_m` around it; the object
-    is taken to keep its perceived velocity.
-    """
-
-    horizon_s: Positive = 3.0
-    margin_m: Margin = 0.5
-
-
-class Measure(Frozen):
-    """What is measured, and from when."""
-
-    objects: Objects = Objects()
-    onset: Onset = InRange()
-    count_earlier: Flag = False
-    confirm: Confirm = Confirm()
-    distance_to: Id = "ego"
-    horizon_s: Positive | None = None
-    conflict: Conflict | None = None
-    exact: Flag = False
 
 
 class Braking(Frozen):
@@ -286,10 +195,11 @@ class Read(Frozen):
 
 
 class Show(Frozen):
-    """Which logs and which run are written to MCAP and .rrd; `run: null` writes none."""
+    """Which logs, run and configurations (by default all) are written to MCAP and .rrd; `run: null` writes none."""
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst"] | None = 0
+    configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
 
 
 class Experiment(Frozen):
@@ -312,13 +222,28 @@ class Experiment(Frozen):
     sweep: Sweep | None = None
     show: Show | None = Show()
 
+    @property
+    def modelled(self) -> dict[str, Unit]:
+        """The units that have a PEM."""
+        return {name: unit for name, unit in self.units.items() if unit.recorded is None}
+
+    @property
+    def recorded(self) -> dict[str, Recorded]:
+        """The units whose lists are recorded in the log."""
+        return {name: unit.recorded for name, unit in self.units.items() if unit.recorded is not None}
+
     def units_of(self, configuration: Configuration) -> tuple[str, ...]:
         """Names of the units of a configuration, in the experiment's order; none for the truth."""
         if configuration.units == "truth":
             return ()
         if configuration.units == "all":
-            return tuple(self.units)
+            return tuple(self.modelled)
         return tuple(name for name in self.units if name in configuration.units)
+
+    def shown(self) -> dict[str, Configuration]:
+        """The configurations that are written to MCAP and .rrd."""
+        wanted = self.show.configurations if self.show is not None else None
+        return {name: c for name, c in self.configurations.items() if wanted is None or name in wanted}
 
     def as_written(self) -> dict[str, Any]:
         """The experiment with every default filled in, as plain data for YAML."""

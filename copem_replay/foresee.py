@@ -12,8 +12,8 @@ import numpy as np
 
 from copem_replay.braking.boxes import pose_on
 from copem_replay.braking.course import EgoCourse
-from copem_replay.experiment import Confirm, Conflict
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
+from copem_replay.measure_keys import Confirm, Conflict
 from copem_replay.onset import Looks
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int
 
@@ -37,8 +37,7 @@ def foreseen(
     implied = np.zeros(fused.valid.shape, dtype=np.bool_)
     columns = (fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
     _implied(fused.valid, *columns, fused.frame_ix, pieces, bounds, wanted.horizon_s, implied)
-    newest_s = np.full(fused.valid.shape, -np.inf)
-    _newest(belief.heard.valid, belief.heard.row_captured_s, belief.entries, belief.start, newest_s)
+    newest_s = belief.captured_s
     result = np.full((len(fused.valid), len(found.object_ix)), np.nan)
     track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
     for m, object_ix in enumerate(found.object_ix):
@@ -145,15 +144,6 @@ def _will_be_in(
         if first > last:
             return False
     return True
-
-
-@nb.njit(cache=True, nogil=True)
-def _newest(valid: Bool, captured_s: Float, entries: Int, start: Int, out: Float) -> None:
-    for s in range(out.shape[0]):
-        for p in range(out.shape[1]):
-            for c in range(start[p], start[p + 1]):
-                if valid[s, entries[c]]:
-                    out[s, p] = max(out[s, p], captured_s[entries[c]])
 
 
 @nb.njit(cache=True, nogil=True)

@@ -16,9 +16,9 @@ from google.protobuf.message import DecodeError
 
 from copem_replay import container
 from copem_replay.errors import RecordingError
-from copem_replay.formats import detail, sensor_data
+from copem_replay.formats import detail, osi, sensor_data
 from copem_replay.resample import wrap
-from copem_replay.tracks import UNCERTAINTIES, VALUES, Scene, Tracks
+from copem_replay.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 
 
 @dataclass
@@ -31,6 +31,10 @@ class _Rows:
     track: list[int] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
     variances: list[tuple[float, ...]] = field(default_factory=list)
+    existence: list[float] = field(default_factory=list)  # NaN: not said
+    likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as it is said
+    spread_said: list[bool] = field(default_factory=list)
+    capture_said: list[bool] = field(default_factory=list)  # of every list
 
 
 def read_lists(path: Path, topic: str, scene: Scene) -> Tracks:
@@ -38,21 +42,84 @@ def read_lists(path: Path, topic: str, scene: Scene) -> Tracks:
 
     Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
+    return _tracks(*_all_rows(path, topic), topic, scene)
+
+
+@dataclass(frozen=True)
+class RecordedLists:
+    """Lists as a unit made them. Every row of `tracks` is a track of its own, without truth id: (P,) each.
+
+    `existence` is NaN where it is not said; `class_probability (P, C)` sums to 1. `spread_said`: whether the list gives
+    the covariance of the position, else it is 0. `capture_said (F,)`: whether the list says when it was captured.
+    """
+
+    tracks: Tracks
+    existence: Float
+    class_probability: Float
+    track_id: Int
+    spread_said: Bool
+    capture_said: Bool
+    dropped: int  # entries that had no place
+
+
+def read_recorded(path: Path, topic: str, scene: Scene) -> RecordedLists:
+    """The lists on `topic` with all they say, but ids of the truth. Raises RecordingError as `read_lists`."""
+    rows, _ = _all_rows(path, topic)
+    stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
+    by_time = np.argsort(stamps[:, 1], kind="stable")
+    place = np.empty_like(by_time)
+    place[by_time] = np.arange(len(by_time))
+    frame = place[np.array(rows.frame, dtype=np.int64)]
+    values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))
+    variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))
+    placed = np.isfinite(values[:, :2]).all(axis=1)
+    order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
+    values, variances = np.nan_to_num(values[order]), np.nan_to_num(variances[order])
+    probability = np.zeros((len(order), len(CLASSES)))
+    for p, k in enumerate(order):
+        for index, share in rows.likely[k].items():
+            probability[p, index] += share
+    none = probability.sum(axis=1) <= 0
+    probability[none, osi.OTHER] = 1.0
+    tracks = _as_tracks(
+        topic,
+        scene,
+        stamps[by_time],
+        np.arange(len(order) + 1),
+        np.full(len(order), -1),
+        frame[order],
+        values,
+        variances,
+    )
+    return RecordedLists(
+        tracks,
+        np.array(rows.existence, dtype=float)[order],
+        probability / probability.sum(axis=1, keepdims=True),
+        # OSI's identifiers are unsigned: what is beyond the signed ones is brought among them.
+        np.array(rows.track, dtype=np.uint64)[order].astype(np.int64),
+        np.array(rows.spread_said, dtype=bool)[order],
+        np.array(rows.capture_said, dtype=bool)[by_time],
+        int((~placed).sum()),
+    )
+
+
+def _all_rows(path: Path, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     log = container.open_log(path)
     try:
-        return _read(log, topic, scene)
+        return _read(log, topic)
     except container.BrokenIndexError as error:
-        return _read(container.from_start(path, error.__cause__, log.channels), topic, scene)
+        return _read(container.from_start(path, error.__cause__, log.channels), topic)
 
 
-def _read(log: container.Log, topic: str, scene: Scene) -> Tracks:
+def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == sensor_data.SCHEMA}
     if not chosen:
         there = sorted(c.topic for c in log.channels if c.schema == sensor_data.SCHEMA)
         raise RecordingError(f"{log.path}: no {sensor_data.SCHEMA} on topic {topic!r}; it is on {there or 'none'}")
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == detail.SCHEMA}
-    rows, details = _Rows(), {}
+    rows = _Rows()
+    details: dict[int, dict[str, Any]] = {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
             content = detail.parse(payload)
@@ -63,7 +130,7 @@ def _read(log: container.Log, topic: str, scene: Scene) -> Tracks:
             except DecodeError as error:
                 raise RecordingError(f"{log.path}: {topic}: a message cannot be decoded: {error}") from None
             _add(rows, message, log_time_ns)
-    return _tracks(rows, details, topic, scene)
+    return rows, details
 
 
 def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
@@ -73,6 +140,7 @@ def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
     captured_ns = last.seconds * 10**9 + last.nanos if message.HasField("last_measurement_time") else arrives_ns
     frame = len(rows.stamps)
     rows.stamps.append((captured_ns, arrives_ns))
+    rows.capture_said.append(message.HasField("last_measurement_time"))
     for item in [*message.moving_object, *message.stationary_object]:
         base, spread = item.base, item.base_rmse
         place, size, speed = base.position, base.dimension, getattr(base, "velocity", None)
@@ -86,6 +154,24 @@ def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
         fast = spread.velocity.x if speed is not None else 0.0
         sigma = (spread.position.x, 0.0, spread.position.y, spread.orientation.yaw, spread.dimension.length, fast)
         rows.variances.append(tuple(s * s for s in sigma))
+        header = item.header
+        said = header.HasField("existence_probability")
+        rows.existence.append(header.existence_probability if said else np.nan)
+        rows.likely.append(_likely(item))
+        rows.spread_said.append(spread.position.HasField("x") and spread.position.HasField("y"))
+
+
+def _likely(item: Any) -> dict[int, float]:
+    """Probability by class of what a unit takes a moving object for; stationary ones have no class here."""
+    likely: dict[int, float] = {}
+    for candidate in getattr(item, "candidate", ()):
+        if not hasattr(candidate, "vehicle_classification"):  # a stationary object's
+            continue
+        vehicle = candidate.vehicle_classification
+        kind = osi.class_of(candidate.type, vehicle.type if candidate.HasField("vehicle_classification") else None)
+        share = candidate.probability if candidate.HasField("probability") else 1.0
+        likely[kind] = likely.get(kind, 0.0) + max(share, 0.0)
+    return likely
 
 
 def _in_world(
@@ -124,17 +210,26 @@ def _tracks(rows: _Rows, details: dict[int, dict[str, Any]], topic: str, scene: 
         item = details.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
         if item is not None:
             variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
+    start = np.append(first, len(order))
+    return _as_tracks(topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances)
+
+
+def _as_tracks(
+    topic: str, scene: Scene, stamps: Int, start: Int, object_ix: Int, frame_ix: Int, values: Float, variances: Float
+) -> Tracks:
+    """Tracks of one unit: `stamps (F, 2)` captured and arriving, `start (E + 1,)`, `object_ix (E,)`, rows (P,)."""
+    seconds = (stamps - scene.t0_ns) * np.float64(1e-9)
     return Tracks(
         units=(topic,),
-        start=np.append(first, len(order)),
-        unit_ix=np.zeros(len(first), dtype=np.int64),
-        object_ix=object_ix[order][first],
-        frame_ix=frame[order],
-        stamp_ns=stamps[by_time, 0],
-        captured_s=(stamps[by_time, 0] - scene.t0_ns) * 1e-9,
+        start=start,
+        unit_ix=np.zeros(len(object_ix), dtype=np.int64),
+        object_ix=object_ix,
+        frame_ix=frame_ix,
+        stamp_ns=stamps[:, 0],
+        captured_s=seconds[:, 0],
         frame_unit_ix=np.zeros(len(stamps), dtype=np.int64),
-        arrives_s=((stamps[by_time, 1] - scene.t0_ns) * 1e-9)[None],
-        valid=np.ones((1, len(order)), dtype=bool),
+        arrives_s=seconds[None, :, 1],
+        valid=np.ones((1, len(frame_ix)), dtype=bool),
         **{name: values[None, :, k] for k, name in enumerate(VALUES)},
         **{name: variances[None, :, k] for k, name in enumerate(UNCERTAINTIES)},
     )

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.errors import ExperimentError
-from copem_replay.experiment import Appears, At, Carriers, Experiment, InRange, LineOfSight, Measure, StartsMoving
+from copem_replay.experiment import Carriers, Experiment
+from copem_replay.measure_keys import Appears, At, InRange, LineOfSight, Measure, StartsMoving
 from copem_replay.resample import states_at, wrap
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.units import carrier, moved, observers, poses, unit_ground

@@ -70,32 +70,38 @@ class _Draws:
 
 def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws: _Draws) -> Tracks:
     S, P = seen.valid.shape
-    columns: dict[str, Any] = {
-        name: np.repeat(getattr(seen, name), S, axis=0)
-        for name in ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
-    }
+    columns: dict[str, Any] = {}
+
+    def per_run(name: str) -> Float:
+        # What has no error keeps its one row for all runs.
+        if name not in columns:
+            columns[name] = np.repeat(getattr(seen, name), S, axis=0)
+        column: Float = columns[name]
+        return column
+
     spread: dict[str, Any] = {
         name: np.zeros((1, P))
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
-    for k, unit in enumerate(experiment.units.values()):
-        for c, couple in enumerate(experiment.pems[unit.pem]):
+    for k, unit in enumerate(experiment.modelled.values()):
+        for c, couple in enumerate(experiment.pems[str(unit.pem)]):
             rows = np.flatnonzero((seen.row_unit_ix == k) & (found.couple_ix == c))
             if couple.error is None or not len(rows):
                 continue
             where = f"pems.{unit.pem}[{c}].error"
             errors = errors_of(couple.error, found.look.take(rows), partial(draws.normal, rows), S, where)
-            columns["x_m"][:, rows] += errors.east_m
-            columns["y_m"][:, rows] += errors.north_m
+            per_run("x_m")[:, rows] += errors.east_m
+            per_run("y_m")[:, rows] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
                 spread[name][0, rows] = getattr(errors, name)
             if errors.yaw_rad is not None:
-                columns["yaw_rad"][:, rows] = wrap(columns["yaw_rad"][:, rows] + errors.yaw_rad)
+                yaw = per_run("yaw_rad")
+                yaw[:, rows] = wrap(yaw[:, rows] + errors.yaw_rad)
                 spread["yaw_var_rad2"][0, rows] = errors.yaw_var_rad2
             if errors.size_m is not None:
                 for axis, name in enumerate(("length_m", "width_m", "height_m")):
-                    sized = columns[name][:, rows] + errors.size_m[axis]
-                    columns[name][:, rows] = np.maximum(sized, SMALLEST_SIZE_M)
+                    size = per_run(name)
+                    size[:, rows] = np.maximum(size[:, rows] + errors.size_m[axis], SMALLEST_SIZE_M)
                 spread["size_var_m2"][0, rows] = errors.size_var_m2
             if errors.speed_mps is not None:
                 speed = found.look.speed_mps[rows]
@@ -106,7 +112,7 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws:
                 north = np.where(
                     speed > 0, seen.vy_mps[0, rows] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, rows])
                 )
-                columns["vx_mps"][:, rows] += errors.speed_mps * east
-                columns["vy_mps"][:, rows] += errors.speed_mps * north
+                per_run("vx_mps")[:, rows] += errors.speed_mps * east
+                per_run("vy_mps")[:, rows] += errors.speed_mps * north
                 spread["speed_var_m2ps2"][0, rows] = errors.speed_var_m2ps2
     return replace(seen, **columns, **spread)

@@ -6,9 +6,10 @@ Selects the truth by the names of schemas, decodes it, and says what it skipped,
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from copem_replay.formats import osi
 from copem_replay.formats.columns import Columns
 from copem_replay.tracks import CLASSES, Scene, Tracks
 from copem_replay.wording import counted
+
+if TYPE_CHECKING:  # it imports much that a look at a recording does not need
+    from copem_replay.lists import RecordedLists
 
 _SHOWN = 12  # ids named in an error (chosen)
 
@@ -39,21 +43,27 @@ class Recording:
     notes: tuple[str, ...]  # a line per kind of thing derived, corrected, skipped or ignored
     host_id: str | None
     damage: str | None = None  # what is wrong with the file and how far it could be read; among the notes, too
+    lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
 
 
-def read(path: Path | str, *, name: str, ego: str | None = None, topic: str | None = None) -> Recording:
+def read(
+    path: Path | str, *, name: str, ego: str | None = None, topic: str | None = None, beside: Collection[str] = ()
+) -> Recording:
     """Read the truth of the recording at `path`, as the log called `name`.
 
     `ego`: id of the ego vehicle, None for the host vehicle the log names. `topic`: where the truth is, None
-    where there is only one candidate. Raises RecordingError, one line: no such file, no MCAP file, no truth,
+    where there is only one candidate. `beside`: topics that somebody else reads.
+    Raises RecordingError, one line: no such file, no MCAP file, no truth,
     no usable object, no such ego, no such topic, or several.
     """
-    return read_log(container.open_log(Path(path)), name=name, ego=ego, topic=topic)
+    return read_log(container.open_log(Path(path)), name=name, ego=ego, topic=topic, beside=beside)
 
 
-def read_log(log: Log, *, name: str, ego: str | None = None, topic: str | None = None) -> Recording:
+def read_log(
+    log: Log, *, name: str, ego: str | None = None, topic: str | None = None, beside: Collection[str] = ()
+) -> Recording:
     """Do the same with a log that was opened before."""
-    topic, ignored = choose_topic(log, topic)
+    topic, ignored = choose_topic(log, topic, beside)
     try:
         columns = _decode(log, topic)
     except container.BrokenIndexError as error:
@@ -83,7 +93,7 @@ def truth_topics(log: Log) -> dict[str, str]:
     return {c.topic: c.schema for c in log.channels if is_truth(c) and c.messages}
 
 
-def choose_topic(log: Log, topic: str | None = None) -> tuple[str, list[str]]:
+def choose_topic(log: Log, topic: str | None = None, beside: Collection[str] = ()) -> tuple[str, list[str]]:
     """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
     if not any(c.messages for c in log.channels):
         raise RecordingError(f"{log.path}: holds no message ({_listed(log.channels) or 'and no channel'})")
@@ -101,7 +111,7 @@ def choose_topic(log: Log, topic: str | None = None) -> tuple[str, list[str]]:
             f"{log.path}: true objects on several topics, {_named(topics)}: "
             "choose one with `read: {topic: …}` in the experiment"
         )
-    return chosen, _ignored(log, chosen, topics)
+    return chosen, _ignored(log, chosen, topics, beside)
 
 
 def _only(topics: dict[str, str]) -> str | None:
@@ -111,12 +121,12 @@ def _only(topics: dict[str, str]) -> str | None:
     return candidates[0] if len(candidates) == 1 else None
 
 
-def _ignored(log: Log, chosen: str, topics: dict[str, str]) -> list[str]:
+def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[str]) -> list[str]:
     """Say what is not read."""
     notes = [f"topic {t} ({schema}) not read: {chosen} taken" for t, schema in topics.items() if t != chosen]
     skipped = Counter[str]()
     for channel in log.channels:
-        if channel.messages and not is_truth(channel):
+        if channel.messages and not is_truth(channel) and channel.topic not in beside:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
     return notes + [f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
 

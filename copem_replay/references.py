@@ -9,8 +9,8 @@ import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from copem_replay.experiment import LONGEST_CHAIN
 from copem_replay.experiment_file import Source
+from copem_replay.measure_keys import LONGEST_CHAIN
 from copem_replay.plain_yaml import Key
 
 NO_EGO = "none"
@@ -30,15 +30,25 @@ def references(source: Source) -> Iterator[str]:
     measure = data.get("measure")
     if isinstance(measure, dict):
         place = measure.get("distance_to", "ego")
+        unit = dict(_items(data.get("units"))).get(str(place), {})
+        if unit.get("recorded") is not None and unit.get("at") is None and unit.get("on") is None:
+            yield source.at(
+                ("measure", "distance_to"), f"unit {place!r} has no place; say `at: [x, y]` or `on: <object id>` of it"
+            )
         if _is_name(place) and place != "ego" and str(place) not in units:
             yield source.at(("measure", "distance_to"), unknown("unit", place, ["ego", *units]))
         onset = measure.get("onset")
-        if isinstance(onset, dict) and onset.get("kind") == "line_of_sight_any" and not units:
+        if isinstance(onset, dict) and onset.get("kind") == "line_of_sight_any" and not _modelled(data):
             yield source.at(("measure", "onset"), "line_of_sight_any: there is no unit to see anything")
     yield from _braking(source, data)
     yield from _carried(source, data)
     yield from _sweep(source, data, units)
     show, runs = data.get("show"), data.get("runs", 1)
+    configurations = _names(data.get("configurations"))
+    chosen = show.get("configurations") if isinstance(show, dict) else None
+    for k, name in enumerate(chosen if isinstance(chosen, list) else []):
+        if _is_name(name) and str(name) not in configurations:
+            yield source.at(("show", "configurations", k), unknown("configuration", name, configurations))
     run = show.get("run") if isinstance(show, dict) else None
     if isinstance(run, int) and isinstance(runs, int) and 1 <= runs <= run:
         yield source.at(("show", "run"), f"expected a run below {runs}, found {run}")
@@ -49,6 +59,15 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
     braking, measure = data.get("braking"), data.get("measure")
     measure = measure if isinstance(measure, dict) else {}
     confirm = measure.get("confirm")
+    if measure.get("exact") is True:
+        match = measure.get("match")
+        if isinstance(match, dict) and match.get("always") is True:
+            yield source.at(("measure", "exact"), "matches depend on sampled errors and have no closed form")
+        recorded = [name for name, unit in _items(data.get("units")) if unit.get("recorded") is not None]
+        if recorded:
+            yield source.at(
+                ("measure", "exact"), f"unit {recorded[0]!r} is recorded: nothing says how probable its lists were"
+            )
     if measure.get("exact") is True and isinstance(confirm, dict):
         of = confirm.get("of", 1)
         if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
@@ -117,8 +136,10 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
 
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
     chosen = configuration.get("units")
-    if chosen == "all" and not units:
-        yield source.at((*key, "units"), "all: the experiment has no units")
+    if chosen == "all" and not _modelled(source.data):
+        which = "modelled units; recorded ones are named" if units else "units"
+        yield source.at((*key, "units"), f"all: the experiment has no {which}")
+    yield from _fusion(source, key, configuration, chosen)
     given: list[str] = []
     for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
         if _is_name(unit) and str(unit) not in units:
@@ -130,6 +151,26 @@ def _configuration(source: Source, key: Key, configuration: dict[str, Any], unit
     for unit in latency if isinstance(latency, dict) else ():
         if unit not in [*units, "default", "truth"]:
             yield source.at((*key, "latency_s", unit), unknown("unit", unit, [*units, "default"]))
+
+
+def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: object) -> Iterator[str]:
+    """What fusions other than the ideal one do not go with."""
+    fusion, measure = configuration.get("fusion"), source.data.get("measure")
+    kind = fusion.get("kind") if isinstance(fusion, dict) else None
+    if not isinstance(kind, str) or kind == "ideal":
+        return
+    if chosen == "truth":
+        yield source.at((*key, "fusion"), f"the truth is not fused; {kind} needs units")
+    if isinstance(measure, dict) and measure.get("exact") is True:
+        yield source.at(
+            ("measure", "exact"),
+            f"configuration {key[-1]!r}: {kind} has no exact times, as what it does depends on sampled errors; only "
+            "ideal fusion has",
+        )
+
+
+def _modelled(data: dict[str, Any]) -> list[str]:
+    return [name for name, unit in _items(data.get("units")) if unit.get("recorded") is None]
 
 
 def _items(mapping: object) -> Iterator[tuple[str, dict[str, Any]]]:

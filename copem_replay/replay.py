@@ -4,38 +4,38 @@ function of it, so that blocks can be computed anywhere, in any order, by any nu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import pandas as pd
 
+from copem_replay.appraise import Appraisal, Surroundings, appraise, match_lists
+from copem_replay.believe import Believed, World, believe, by_truth, listen, seen_by_all
 from copem_replay.braking.course import EgoCourse
 from copem_replay.braking.encounter import Encounter, encounters
 from copem_replay.braking.verdict import passing
 from copem_replay.candidates import Candidates, candidates
 from copem_replay.detect import detect
 from copem_replay.errors import ExperimentError
-from copem_replay.experiment import Configuration, Experiment
+from copem_replay.experiment import Experiment
 from copem_replay.fleet import Fleet, fleet_of
 from copem_replay.foresee import foreseen
-from copem_replay.fusion.ideal import Belief, draw_posterior, fuse
-from copem_replay.fusion.inbox import inbox
+from copem_replay.fusion.as_lists import as_belief
+from copem_replay.fusion.belief import Belief
+from copem_replay.fusion.instants import instants
 from copem_replay.measure import Events, table
 from copem_replay.onset import Looks, looks
-from copem_replay.perceive import perceive
 from copem_replay.read import Recording
+from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
-from copem_replay.tracks import TRUTH, Bool, Float, Int, Scene, Tracks
-from copem_replay.transmit import transmit
+from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
 
-ROWS_TIMES_RUNS = 50_000_000
-"""How many row × run cells a block may hold (chosen: a byte each while only detections are drawn)."""
+BLOCK_BYTES = 200_000_000
+"""How much a block may hold (chosen)."""
 
-STATE_BYTES = 100
-"""Bytes of a row × run cell where states are sampled and fused, too (chosen: a dozen numbers)."""
+STATE_BYTES = 400
+"""Bytes of a row × run cell where states are sampled, fused and measured, else one (chosen: fifty numbers)."""
 
 WORTH_A_BLOCK = 1_000_000
 """Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
@@ -50,6 +50,7 @@ class Replay:
     truth: Tracks  # the world at its own frames, short gaps filled
     found: Candidates
     measured: Candidates  # the rows of objects that are looked at
+    recorded: RecordedUnits | None
     looks: Looks
     encounters: tuple[Encounter, ...]  # those in conflict
 
@@ -66,6 +67,26 @@ class Replay:
             return {}
         return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
 
+    @cached_property
+    def surroundings(self) -> Surroundings:
+        """The truth at the instants of fused lists, each computed once."""
+        return Surroundings(self.scene, self.truth, self.fleet.experiment)
+
+    def world(self, experiment: Experiment, *, measured_only: bool = False) -> World:
+        """The log as the units of an experiment have it, by configuration: all of it, or what is looked at."""
+        found = self.measured if measured_only else self.found
+        return World(self.scene, self.truth, found, self.recorded, fleet_of(experiment, self.scene).experiment)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a block of runs (S,) gave: rows of `detections.parquet`, and by configuration how good the lists were."""
+
+    log: str
+    runs: Int
+    table: pd.DataFrame
+    appraisals: dict[str, Appraisal]
+
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
     """Everything about a log that all runs and configurations share. Raises ExperimentError where an ego is missing.
@@ -80,42 +101,86 @@ def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experime
     fleet = fleet_of(experiment, scene)
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     found = candidates(scene, truth, fleet.experiment)
+    recorded = recorded_units(
+        recording.lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
+    )
     on = looks(scene, truth, found.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)
-    return Replay(scene, fleet, truth, found, found.of_objects(on.object_ix), on, meeting)
+    return Replay(scene, fleet, truth, found, found.of_objects(on.object_ix), recorded, on, meeting)
 
 
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
     """The runs cut into blocks, small enough for memory and enough of them for the workers."""
-    rows = max(len(replay.measured.tracks.frame_ix), 1)
+    states = _needs_all(experiment) or experiment.measure.conflict is not None
+    candidate_rows = replay.found if _needs_all(experiment) else replay.measured
+    rows = max(len(candidate_rows.tracks.frame_ix), 1)
     even = -(-experiment.runs // jobs)
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
     small = max(-(-even // 8), WORTH_A_BLOCK // rows)
-    at_once = ROWS_TIMES_RUNS // (rows * (STATE_BYTES if experiment.measure.conflict is not None else 1))
+    at_once = BLOCK_BYTES // (rows * (STATE_BYTES if states else 1))
     size = max(1, min(at_once, even, small))
     return [np.arange(k, min(k + size, experiment.runs)) for k in range(0, experiment.runs, size)]
 
 
+def _needs_all(experiment: Experiment) -> bool:
+    """Whether anything goes by whole lists, and not only by whether they hold a measured object."""
+    measure = experiment.measure
+    others = any(not by_truth(configuration) for configuration in experiment.configurations.values())
+    return measure.accuracy or measure.match.always or others
+
+
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
-    """The rows of `detections.parquet` of one block of runs (S,)."""
+    """Only what was known and when: the rows of `detections.parquet` of one block of runs (S,), without accuracy."""
+    when = experiment.model_copy(update={"measure": experiment.measure.model_copy(update={"accuracy": False})})
+    return pd.concat([part.table for part in outcomes(replay, when, runs)], ignore_index=True)
+
+
+def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]:
+    """What one block of runs (S,) gives; in several parts where not all runs have the same units."""
     equipped = replay.fleet.equipped(replay.scene.log, runs)
-    if equipped is None or (experiment.measure.confirm.of == 1 and experiment.measure.conflict is None):
-        return _block(replay, experiment, runs, equipped, None)
+    measure = experiment.measure
+    by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_all(experiment)
+    if equipped is None or by_entry:
+        return [_block(replay, experiment, runs, equipped, None)]
     # Which lists there are decides what is consecutive: runs with the same units go together.
     patterns, which = np.unique(equipped, axis=0, return_inverse=True)
-    parts = [_block(replay, experiment, runs[which == k], None, there) for k, there in enumerate(patterns)]
-    return pd.concat(parts, ignore_index=True)
+    return [_block(replay, experiment, runs[which == k], None, there) for k, there in enumerate(patterns)]
 
 
-def _block(
+def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None) -> Outcome:
+    """What runs (S,) give: `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
+    measure = experiment.measure
+    everything = _needs_all(experiment)
+    events = _by_truth_id(replay, experiment, runs, equipped, there)
+    appraisals: dict[str, Appraisal] = {}
+    if everything or measure.conflict is not None:
+        world = replay.world(experiment, measured_only=not everything)
+        for name, believed in believe(world, runs, there):
+            appraisal = None
+            if everything:
+                appraisal = appraise(replay.surroundings, replay.looks, believed, measure, len(runs))
+                if name not in events or measure.match.always:
+                    events[name] = Events(believed.heard.units, appraisal.detections)
+                appraisals[name] = appraisal
+            if measure.conflict is not None:
+                events[name] = replace(events[name], foreseen_s=_foreseen(replay, believed, appraisal, experiment))
+    ordered = {name: events[name] for name in experiment.configurations}
+    rows = table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, ordered)
+    return Outcome(replay.scene.log, runs, rows, appraisals)
+
+
+def _by_truth_id(
     replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None
-) -> pd.DataFrame:
-    """Rows of runs (S,): `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
-    experiment = fleet_of(experiment, replay.scene).experiment
-    seen = perceive(replay.scene, replay.measured, experiment, runs, states="true", equipped=equipped)
-    results: dict[str, Events] = {}
-    for name, configuration in experiment.configurations.items():
-        heard = listen(seen, replay.truth, experiment, configuration, there)
+) -> dict[str, Events]:
+    """Detections of the configurations that have truth ids: they need no states, only who was listed."""
+    world = replay.world(experiment, measured_only=True)
+    chosen = {name: c for name, c in world.experiment.configurations.items() if by_truth(c)}
+    if not chosen:
+        return {}
+    seen = seen_by_all(world, runs, states="true", equipped=equipped)
+    events: dict[str, Events] = {}
+    for name, configuration in chosen.items():
+        heard = listen(seen, replay.truth, world.experiment, configuration, there)
         result = detect(
             heard,
             replay.looks,
@@ -123,67 +188,52 @@ def _block(
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
         )
-        results[name] = Events(heard.units, result)
-    if experiment.measure.conflict is not None:
-        for name, belief in _beliefs(replay, replay.measured, experiment, runs, there):
-            results[name] = replace(results[name], foreseen_s=_foreseen(replay, belief, experiment))
-    return table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, results)
+        events[name] = Events(heard.units, result)
+    return events
 
 
-def _foreseen(replay: Replay, belief: Belief, experiment: Experiment) -> Float:
+def _foreseen(replay: Replay, believed: Believed, appraisal: Appraisal | None, experiment: Experiment) -> Float:
     """(S, M) when each look is first seen to lead to a collision."""
     measure = experiment.measure
     assert measure.conflict is not None
-    return foreseen(
-        belief,
-        replay.ego,
-        replay.looks,
-        measure.conflict,
-        confirm=measure.confirm,
-        count_earlier=measure.count_earlier,
+    beliefs = [believed.belief] if believed.belief is not None else _as_beliefs(believed, appraisal)
+    return np.concatenate(
+        [
+            foreseen(
+                belief,
+                replay.ego,
+                replay.looks,
+                measure.conflict,
+                confirm=measure.confirm,
+                count_earlier=measure.count_earlier,
+            )
+            for belief in beliefs
+        ]
     )
 
 
-def listen(
-    seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration, there: Bool | None = None
-) -> Tracks:
-    """What reaches the receiver in one configuration: the lists of its units, late; those of the others never.
-
-    `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn
-    for them.
-    """
-    if configuration.units == TRUTH:
-        return transmit(truth, configuration.latency_of)
-    heard = set(experiment.units_of(configuration))
-    if there is not None:
-        heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
-    return transmit(seen, lambda unit: configuration.latency_of(unit) if unit in heard else np.inf)
+def _as_beliefs(believed: Believed, appraisal: Appraisal | None) -> list[Belief]:
+    """Lists without truth ids as tracks, run by run, by what they were matched with."""
+    assert appraisal is not None  # they are always matched
+    return [
+        as_belief(believed.lists, s, appraisal.matches, believed.heard, believed.at.issue_s, believed.at.newest)
+        for s in range(len(believed.lists.start))
+    ]
 
 
 def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
     """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
     runs = np.array([run])
     equipped = replay.fleet.equipped(replay.scene.log, runs)
-    experiment = fleet_of(experiment, replay.scene).experiment
-    return dict(_beliefs(replay, replay.found, experiment, runs, None if equipped is None else equipped[0]))
-
-
-def _beliefs(
-    replay: Replay, found: Candidates, experiment: Experiment, runs: Int, there: Bool | None
-) -> Iterator[tuple[str, Belief]]:
-    """Fused lists in the runs (S,), made of the rows of `found`, by the units that are `there (U,)`."""
-    ego = replay.scene.ego_ix
-    seen: dict[bool, Tracks] = {}  # by whether the states are the expected ones; each is made when first needed
-    for name, configuration in experiment.configurations.items():
-        posterior = configuration.fusion.combine == "posterior" and configuration.units != TRUTH
-        if posterior not in seen:
-            states: Literal["expected", "sampled"] = "expected" if posterior else "sampled"
-            seen[posterior] = perceive(replay.scene, found, experiment, runs, states=states)
-        heard = listen(seen[posterior], replay.truth, experiment, configuration, there)
-        belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego)
-        if configuration.units != TRUTH:
-            belief = replace(belief, look=found.look)
-        yield name, draw_posterior(belief, replay.scene, experiment.seed, runs) if posterior else belief
+    there = None if equipped is None else equipped[0]
+    result = {}
+    for name, one in believe(replay.world(experiment), runs, there):
+        if one.belief is not None:
+            result[name] = one.belief
+        else:
+            matches = match_lists(replay.surroundings, one, experiment.measure)
+            result[name] = as_belief(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
+    return result
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
@@ -191,10 +241,11 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
 
     Units that only some runs have are taken to be there.
     """
-    experiment = fleet_of(experiment, replay.scene).experiment
+    world = replay.world(experiment, measured_only=True)
+    seen = seen_by_all(world, np.arange(1), states="true")
     rates = {}
-    for name, configuration in experiment.configurations.items():
-        heard = listen(replay.measured.tracks, replay.truth, experiment, configuration)
-        issue_s = inbox(heard, max_age_s=configuration.max_age_s).issue_s
+    for name, configuration in world.experiment.configurations.items():
+        heard = listen(seen, replay.truth, world.experiment, configuration)
+        issue_s = instants(heard, max_age_s=configuration.max_age_s).issue_s
         rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
     return rates

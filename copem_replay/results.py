@@ -16,9 +16,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from copem_replay.accuracy_tables import AccuracyTables
 from copem_replay.check import place_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
@@ -107,6 +109,8 @@ def _fill(
     write_csv(result.summary, scratch / "summary.csv")
     if result.exact is not None:
         write_parquet(result.exact, scratch / "exact.parquet")
+    if result.accuracy is not None:
+        _write_accuracy(result.accuracy, scratch)
     if result.sweep is not None:
         write_csv(result.sweep, scratch / "sweep.csv")
     notes = list(result.notes)
@@ -126,12 +130,15 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     number = shown_run(experiment, result, log)
     assert number is not None  # shown_logs names none otherwise
     replay = next(r for r in result.replays if r.scene.log == log)
-    alone = of_run(experiment, replay.scene, number)
-    if alone is not experiment:  # with the units that this run has
+    chosen = experiment.model_copy(update={"configurations": experiment.shown()})
+    alone = of_run(chosen, replay.scene, number)
+    if alone is not chosen:  # with the units that this run has
         recording = next(r for r in recordings if r.scene.log == log)
         replay = prepare(recording, alone, onsets_of=experiment)
     beliefs = believed(replay, alone, number)
-    rows = result.table[(result.table["log"] == log) & (result.table["run"] == number)]
+    of_run_shown = (result.table["log"] == log) & (result.table["run"] == number)
+    rows = result.table[of_run_shown & result.table["configuration"].isin(list(chosen.configurations))]
+    summary = result.summary[result.summary["configuration"].isin(list(chosen.configurations))]
     manifest = {
         "copem_replay": version("copem-replay"),
         "experiment": dump(experiment.as_written() | {"logs": [log_path_of(recordings, log).name]}),
@@ -143,9 +150,9 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
         Path(f"{target}.rrd"),
         replay,
         alone,
-        {n: b.fused for n, b in beliefs.items()},
+        beliefs,
         rows,
-        result.summary,
+        summary,
         number,
     )
     return said
@@ -183,14 +190,21 @@ def _utf8(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
-def write_parquet(table: pd.DataFrame, path: Path) -> None:
-    """A table as Parquet: NaN as null, text as `string` whatever pandas keeps it in."""
+def write_parquet(table: Any, path: Path) -> None:
+    """A table, of pandas or of Arrow, as Parquet: NaN as null, text as `string` whatever pandas keeps it in."""
     import pyarrow as pa
     from pyarrow import parquet
 
-    arrow = pa.Table.from_pandas(table, preserve_index=False)
+    arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
     fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
-    parquet.write_table(arrow.cast(pa.schema(fields, arrow.schema.metadata)), path)
+    parquet.write_table(arrow.cast(pa.schema(fields, arrow.schema.metadata)), path, compression="zstd")
+
+
+def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
+    for name in ("accuracy", "instants", "lists", "thresholds"):
+        if (table := getattr(tables, name)) is not None:
+            write_parquet(table, scratch / f"{name}.parquet")
+    write_csv(tables.bands, scratch / "bands.csv")
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:

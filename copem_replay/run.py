@@ -9,13 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from copem_replay import replay as replays
+from copem_replay.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
 from copem_replay.exact import check_exact, exact_table
-from copem_replay.experiment import At, Carriers, Experiment
+from copem_replay.experiment import Carriers, Experiment
+from copem_replay.measure_keys import At
 from copem_replay.onset import measured_objects
 from copem_replay.read import Recording
-from copem_replay.replay import Replay
+from copem_replay.replay import Outcome, Replay
 from copem_replay.summary import horizon_s, summary
 from copem_replay.sweep import Point, points, without_points
 from copem_replay.tracks import CLASSES, TRUTH
@@ -34,6 +37,7 @@ class Result:
     replays: tuple[Replay, ...]  # one per log
     horizon_s: float | None
     exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
+    accuracy: AccuracyTables | None = None  # with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
 
 
@@ -48,7 +52,7 @@ def run(
         if point.same_units:
             check_exact(ready, point.experiment)
     tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)))
-    table = tables.of(ready, experiment)
+    table, parts, order = tables.of(ready, experiment)
     horizon = horizon_s(table, experiment.measure.horizon_s)
     rows, said = summary(
         table,
@@ -57,13 +61,20 @@ def run(
         seed=experiment.seed,
         horizon_s=horizon,
         exact=exact,
+        accuracy=totals(parts),
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
     notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
     notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
     sweep = pd.concat(swept, ignore_index=True) if swept else None
-    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, sweep)
+    accuracy = None
+    if experiment.measure.accuracy and len(experiment.configurations):
+        same_units = all((replay.fleet.share == 1).all() for replay in ready)
+        accuracy = accuracy_tables(parts, order, same_units=same_units)
+        if not same_units:
+            notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
 
 
 def _at_point(
@@ -73,13 +84,15 @@ def _at_point(
     experiment = point.experiment
     if not point.same_units:
         ready = [replays.prepare(recording, experiment) for recording in recordings]
+    table, parts, _ = tables.of(ready, experiment)
     rows, _ = summary(
-        tables.of(ready, experiment),
+        table,
         list(experiment.configurations),
         _rates(ready, experiment),
         seed=experiment.seed,
         horizon_s=horizon,
         exact=_exactly(ready, experiment),
+        accuracy=totals(parts),
     )
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)
@@ -98,28 +111,32 @@ class _Tables:
     def __init__(self, jobs: int, progress: Progress | None, tables: int) -> None:
         self._jobs, self._progress, self._tables, self._done = jobs, progress, tables, 0
 
-    def of(self, ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame:
-        """The rows of `detections.parquet` of an experiment."""
+    def of(
+        self, ready: Sequence[Replay], experiment: Experiment
+    ) -> tuple[pd.DataFrame, list[Outcome], NDArray[np.int64]]:
+        """The rows of `detections.parquet` of an experiment; all outcomes, and the order their rows have got."""
         work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, self._jobs)]
-        parts: list[pd.DataFrame] = []
+        parts: list[list[Outcome]] = []
         pool = ThreadPoolExecutor(self._jobs)
         try:
-            for part in pool.map(lambda item: replays.replay_block(item[0], experiment, item[1]), work):
+            for part in pool.map(lambda item: replays.outcomes(item[0], experiment, item[1]), work):
                 parts.append(part)
                 if self._progress is not None:
                     self._progress(self._done * len(work) + len(parts), self._tables * len(work))
         finally:  # interrupted: what has not begun never does
             pool.shutdown(cancel_futures=True)
         self._done += 1
-        return _in_order(pd.concat(parts, ignore_index=True), [replay.scene.log for replay in ready], experiment)
+        every = [outcome for part in parts for outcome in part]
+        table = pd.concat([with_accuracy(outcome) for outcome in every], ignore_index=True)
+        order = _order(table, [replay.scene.log for replay in ready], experiment)
+        return table.iloc[order].reset_index(drop=True), every, order
 
 
-def _in_order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> pd.DataFrame:
-    """By log, configuration, run and object, however the runs were cut into blocks."""
+def _order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> NDArray[np.int64]:
+    """The order (n,) of rows by log, configuration, run and object, however the runs were cut into blocks."""
     log = table["log"].map({name: k for k, name in enumerate(logs)}).to_numpy()
     configuration = table["configuration"].map({n: k for k, n in enumerate(experiment.configurations)}).to_numpy()
-    order = np.lexsort((table["run"].to_numpy(), configuration, log))
-    return table.iloc[order].reset_index(drop=True)
+    return np.lexsort((table["run"].to_numpy(), configuration, log))
 
 
 def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float | None]:

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
+from copem_replay.accuracy import FIGURES, Total
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.statistics import (
     CENSORED,
@@ -46,8 +47,12 @@ def summary(
     seed: int,
     horizon_s: float | None,
     exact: pd.DataFrame | None = None,
+    accuracy: Mapping[str, Total] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv`, and what has to be said about them. `exact`: the rows of `exact.parquet`."""
+    """The rows of `summary.csv`, and what has to be said about them.
+
+    `exact`: the rows of `exact.parquet`. `accuracy`: by configuration the sums its figures are made of.
+    """
     notes: list[str] = []
     judged = table[table["conflict"]] if "conflict" in table else table.iloc[:0]
     for what, rows_of, whom in (("detected", table, "measured objects"), ("pass", judged, "objects in conflict")):
@@ -67,6 +72,8 @@ def summary(
             row |= _foreseen(part, horizon_s)
         if "conflict" in table:
             row |= _verdicts(part[part["conflict"]], seed)
+        if accuracy:
+            row |= {figure: of(accuracy[name]) for figure, of in FIGURES.items()}
         if exact is not None:
             row |= _exactly(exactly.get(name, exact.iloc[:0]), horizon_s, len(part))
         rows.append(row)

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from copem_replay.experiment import Carriers, Configuration, Experiment, Measure, Unit
+from copem_replay.experiment import Carriers, Configuration, Experiment, Unit
+from copem_replay.measure_keys import Measure
 from copem_replay.tracks import TRUTH
 
 KINDS = ("latency_s", "rate_hz", "units", "share")
@@ -58,9 +59,10 @@ def without_points(experiment: Experiment) -> list[str]:
 
 
 def _measured(experiment: Experiment) -> Measure:
-    """Perceived conflicts take time, and are not asked for unless somebody brakes for them."""
+    """Perceived conflicts take time, and are not asked for unless somebody brakes for them; accuracy never is."""
     needed = experiment.braking is not None and experiment.braking.brakes_for == "conflict"
-    return experiment.measure if needed else experiment.measure.model_copy(update={"conflict": None})
+    conflict = experiment.measure.conflict if needed else None
+    return experiment.measure.model_copy(update={"conflict": conflict, "accuracy": False})
 
 
 def _curves(
@@ -111,7 +113,9 @@ def _configuration_at(
 
 def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
     if kind == "rate_hz":
-        return {name: unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()}
+        return {
+            name: unit if unit.recorded else unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()
+        }
     if kind == "share":
         return {
             name: unit.model_copy(update={"on": unit.on.model_copy(update={"share": value})})

@@ -15,6 +15,7 @@ list shows), *arrives* (when the receiver has it), *now*.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -186,6 +187,48 @@ class Tracks:
             frame_ix=self.frame_ix[rows],
             **columns,
         )
+
+
+def joined(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
+    """Tracks of several units as one; each piece has lists, and units, of its own. `units`: of all, in their order.
+
+    Values of a piece that all runs share are repeated where another's differ; a variance that only some have is 0 for
+    the others.
+    """
+    none = np.empty(0, dtype=np.int64)
+    row_offset = np.concatenate([[0], np.cumsum([len(p.frame_ix) for p in pieces])]).astype(np.int64)
+    frame_offset = np.concatenate([[0], np.cumsum([len(p.stamp_ns) for p in pieces])]).astype(np.int64)
+    unit_offset = np.concatenate([[0], np.cumsum([len(p.units) for p in pieces])]).astype(np.int64)
+
+    def shifted(name: str, offset: Int) -> Int:
+        return np.concatenate([none, *(getattr(p, name) + offset[k] for k, p in enumerate(pieces))])
+
+    def rows(name: str) -> Any:
+        columns = [getattr(p, name) for p in pieces]
+        if name in UNCERTAINTIES:
+            if all(column is None for column in columns):
+                return None
+            columns = [
+                np.zeros((1, len(p.frame_ix))) if column is None else column
+                for p, column in zip(pieces, columns, strict=True)
+            ]
+        runs = max((len(column) for column in columns), default=1)
+        columns = [np.broadcast_to(column, (runs, column.shape[1])) for column in columns]
+        return np.concatenate([np.empty((runs, 0), dtype=columns[0].dtype if columns else float), *columns], axis=1)
+
+    return Tracks(
+        units=units,
+        start=np.concatenate([[0], *(p.start[1:] + row_offset[k] for k, p in enumerate(pieces))]),
+        unit_ix=shifted("unit_ix", unit_offset),
+        object_ix=np.concatenate([none, *(p.object_ix for p in pieces)]),
+        frame_ix=shifted("frame_ix", frame_offset),
+        stamp_ns=np.concatenate([none, *(p.stamp_ns for p in pieces)]),
+        captured_s=np.concatenate([np.empty(0), *(p.captured_s for p in pieces)]),
+        frame_unit_ix=shifted("frame_unit_ix", unit_offset),
+        arrives_s=np.concatenate([np.empty((1, 0)), *(p.arrives_s for p in pieces)], axis=1),
+        valid=rows("valid").astype(bool),
+        **{name: rows(name) for name in (*VALUES, *UNCERTAINTIES)},
+    )
 
 
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")

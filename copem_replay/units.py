@@ -87,7 +87,7 @@ def mounting_height(scene: Scene, truth: Tracks, unit: Unit) -> float:
 
 def carrier(scene: Scene, unit: Unit) -> int:
     """Index of the object that carries a unit, −1 for a fixed place."""
-    if unit.at is not None:
+    if unit.on is None:
         return -1
     return scene.ego_ix if unit.on == "ego" else scene.object_number[str(unit.on)]
 

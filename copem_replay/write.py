@@ -24,7 +24,7 @@ from mcap.writer import Writer
 from copem_replay.atomic import atomic_file
 from copem_replay.colours import configuration_colours
 from copem_replay.formats import detail, foxglove, sensor_data
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
 from copem_replay.passthrough import Catalogue, Original
 from copem_replay.tracks import Scene, Tracks
 

@@ -6,13 +6,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 from scipy.special import ndtri
 
+from copem_replay.accuracy_tables import with_accuracy
 from copem_replay.chance import Address, Dice, normal_quantile, object_words, philox4x32, stable_hash
 from copem_replay.read import Recording
-from copem_replay.replay import believed, blocks, prepare, replay_block
+from copem_replay.replay import believed, blocks, outcomes, prepare
 from copem_replay.run import run
 from copem_replay.tracks import Tracks
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -145,7 +147,7 @@ def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
     whole = run(plan(), [log]).table
     ready = prepare(log, plan())
     for cut in ([0], [5], [11], [3, 4, 5], [0, 7]):
-        part = replay_block(ready, plan(), np.array(cut))
+        part = pd.concat([with_accuracy(one) for one in outcomes(ready, plan(), np.array(cut))])
         expected = rows_of(whole, run=cut)
         keys = ["configuration", "run", "object_id"]
         assert part.sort_values(keys).reset_index(drop=True).equals(expected.sort_values(keys).reset_index(drop=True))

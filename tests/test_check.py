@@ -67,6 +67,71 @@ class TestReferences:
         found = without_logs(tmp_path, changed("  PEM: {units: [ego, mast, ego]}"))
         assert found == ["15: configurations.PEM.units[2]: unit 'ego' named twice"]
 
+    def test_configurations_that_are_shown(self, tmp_path: Path) -> None:
+        assert without_logs(tmp_path, changed("show: {configurations: [coPEM, GT]}")) == []
+        assert without_logs(tmp_path, changed("show: {configurations: [coPEN, GT, 5]}")) == [
+            "18: show.configurations[0]: no configuration is named 'coPEN'; did you mean coPEM?",
+            "18: show.configurations[2]: no configuration is named '5'; there are GT, PEM, coPEM",
+        ]
+
+    def test_a_recorded_unit_without_a_place(self, tmp_path: Path) -> None:
+        """Distances cannot be measured from it, and `all` does not mean it."""
+        measure = "measure: {distance_to: mast}"
+        nowhere = "unit 'mast' has no place; say `at: [x, y]` or `on: <object id>` of it"
+        for place, expected in (
+            ("", [f"17: measure.distance_to: {nowhere}"]),
+            ("at: [1, 2], ", []),
+            ("on: 2, ", []),
+            ("on: ego, ", []),
+        ):
+            mast = f"  mast: {{{place}recorded: {{topic: lists}}}}"
+            assert without_logs(tmp_path, changed(mast, measure)) == expected, place
+            assert without_logs(tmp_path, changed(mast)) == [], place
+
+    def test_a_recorded_unit_called_ego_needs_no_place(self, tmp_path: Path) -> None:
+        """`distance_to: ego` is the vehicle, whatever units are called."""
+        for measure in ("measure: {}", "measure: {distance_to: ego}"):
+            text = changed("  ego: {recorded: {topic: a}}", measure)
+            assert without_logs(tmp_path, text) == []
+
+    def test_all_units_where_all_are_recorded(self, tmp_path: Path) -> None:
+        text = changed("  ego: {on: ego, recorded: {topic: a}}", "  mast: {recorded: {topic: b}}")
+        assert without_logs(tmp_path, text) == [
+            "16: configurations.coPEM.units: all: the experiment has no modelled units; recorded ones are named"
+        ]
+        assert without_logs(tmp_path, text.replace("units: all", "units: [mast]")) == []
+        sight = text.replace("units: all", "units: [mast]").replace(
+            "kind: in_range, range_m: 60", "kind: line_of_sight_any"
+        )
+        assert without_logs(tmp_path, sight) == [
+            "17: measure.onset: line_of_sight_any: there is no unit to see anything"
+        ]
+
+    @pytest.mark.parametrize("kind", ["union", "nms", "gnn", "tracker"])
+    def test_the_truth_is_not_fused(self, tmp_path: Path, kind: str) -> None:
+        text = changed(f"  GT: {{units: truth, fusion: {{kind: {kind}}}}}")
+        assert without_logs(tmp_path, text) == [
+            f"14: configurations.GT.fusion: the truth is not fused; {kind} needs units"
+        ]
+        assert without_logs(tmp_path, text.replace(kind, "ideal")) == []
+
+    @pytest.mark.parametrize(
+        ("changes", "expected"),
+        [
+            (["  coPEM: {units: all, fusion: {kind: gnn}}"],
+             "configuration 'coPEM': gnn has no exact times, as what it does depends on sampled errors; only ideal "
+             "fusion has"),
+            (["  mast: {recorded: {topic: lists}}"],
+             "unit 'mast' is recorded: nothing says how probable its lists were"),
+            ([], "matches depend on sampled errors and have no closed form"),
+        ],
+    )  # fmt: skip
+    def test_what_has_no_exact_times(self, tmp_path: Path, changes: list[str], expected: str) -> None:
+        always = "" if changes else ", match: {always: true}"
+        text = changed(*changes, f"measure: {{exact: true{always}}}")
+        assert without_logs(tmp_path, text) == [f"17: measure.exact: {expected}"]
+        assert without_logs(tmp_path, text.replace("exact: true", "exact: false")) == []
+
     @pytest.mark.parametrize("run", [4, 1_000_000])
     def test_run_that_is_not_made(self, tmp_path: Path, run: int) -> None:
         found = without_logs(tmp_path, changed(f"show: {{run: {run}}}"))

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 from copem_replay import cli, plain_yaml, results, run
+from copem_replay.compare import compare, comparison_markdown, comparison_text
 from copem_replay.experiment_file import load, parse
 from experiments import TEXT, changed, drive
 from recordings import Obj, truth_topic, write_mcap, write_recording
@@ -101,6 +102,9 @@ class TestUsage:
             (["run", "e.yaml", "--seed", "1.5"], "Invalid value for '--seed': "),
             (["run", "e.yaml", "--jobs", "0"], "Invalid value for '--jobs': "),
             (["run", "e.yaml", "--jobs", "1000000"], "Invalid value for '--jobs': "),
+            (["compare"], "Missing argument 'DIR...'."),
+            (["compare", "out", "--ghosts-per-min", "-1"], "Invalid value for '--ghosts-per-min': "),
+            (["compare", "out", "--ghosts-per-min", "few"], "Invalid value for '--ghosts-per-min': "),
             (["view"], "Missing argument 'DIR'."),
             (["schema", "all"], "unexpected extra argument"),
         ],
@@ -113,7 +117,7 @@ class TestUsage:
         assert line.startswith("copem-replay: ")
         assert said in line
 
-    @pytest.mark.parametrize("command", [[], ["info"], ["check"], ["run"], ["view"], ["schema"]])
+    @pytest.mark.parametrize("command", [[], ["info"], ["check"], ["run"], ["compare"], ["view"], ["schema"]])
     @pytest.mark.parametrize("option", ["--help", "-h"])
     def test_help(self, call: Call, command: list[str], option: str) -> None:
         ended = call(*command, option)
@@ -326,7 +330,8 @@ class TestRun:
         assert ended.lines == []
         assert ended.out.endswith("results in out/e\n")
         assert sorted(written(here / "out" / "e")) == [
-            "detections.parquet", "experiment.yaml", "provenance.json", "summary.csv",
+            "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
+            "lists.parquet", "provenance.json", "summary.csv", "thresholds.parquet",
         ]  # fmt: skip
         assert os.listdir(here / "out") == ["e"]
         assert set(table(here / "out" / "e")["configuration"]) == {"GT", "PEM", "coPEM"}
@@ -597,9 +602,13 @@ class TestWrittenExperiment:
         assert data["logs"] == ["../../drive.mcap"]
         assert data["units"]["ego"] == {
             "on": "ego", "at": None, "offset_m": [0.0, 0.0], "yaw_deg": 0.0, "height_m": 1.8, "ground_z_m": None,
-            "pem": "onboard", "rate_hz": None, "phase_s": 0.0,
+            "pem": "onboard", "recorded": None, "rate_hz": None, "phase_s": 0.0,
         }  # fmt: skip
         assert data["measure"]["confirm"] == {"hits": 1, "of": 1}
+        assert data["measure"]["match"] == {"gate_m": 3.0, "always": False}
+        assert data["measure"]["gospa"] == {"cutoff_m": None, "power": 2.0}
+        assert data["measure"]["accuracy"] is True
+        assert data["configurations"]["PEM"]["fusion"] == {"kind": "ideal", "combine": "samples"}
         assert "jobs" not in text
         assert str(here) not in "".join(map(str, written(here / "out/e").values()))
 
@@ -613,6 +622,69 @@ class TestWrittenExperiment:
         for out in ("one", "two"):
             assert call("run", "e.yaml", "--out", out).code == 0
         assert written(here / "one") == written(here / "two")
+
+
+class TestCompare:
+    @pytest.fixture
+    def fused(self, here: Path, call: Call) -> Path:
+        """Results of ideal fusion and of none at all."""
+        (here / "e.yaml").write_text(changed("  PEM: {units: all, latency_s: 0.5, fusion: {kind: union}}"))
+        assert call("run", "e.yaml", "--seed", "2").code == 0
+        return here
+
+    def test_prints_what_the_library_finds(self, fused: Path, call: Call) -> None:
+        found = compare([fused / "out/e"], baseline="coPEM")
+        assert found.configurations == ("GT", "PEM")
+        ended = call("compare", "out/e", "--baseline", "coPEM")
+        assert ended.code == 0
+        assert ended.out.split() == comparison_text(found).split()
+        assert ended.lines == [f"note: {note}" for note in found.notes]
+
+    def test_of_some_configurations_into_a_file(self, fused: Path, call: Call) -> None:
+        options = ["--baseline", "coPEM", "--configurations", "PEM", "--ghosts-per-min", "3"]
+        found = compare([fused / "out/e"], baseline="coPEM", configurations=["PEM"], ghosts_per_min=3.0)
+        for name in ("c.csv", "c.md"):
+            ended = call("compare", "out/e", *options, "--out", name)
+            assert ended.code == 0
+            assert ended.out.endswith(f"written to {name}\n")
+        kept = pd.read_csv(fused / "c.csv")
+        assert kept["metric"].tolist() == found.table["metric"].tolist()
+        assert kept["difference"].to_numpy() == pytest.approx(found.table["difference"].to_numpy(), nan_ok=True)
+        assert set(kept["configuration"]) == {"PEM"}
+        assert "ttd_rmst_s_equal_ghosts" in set(kept["metric"])
+        assert (fused / "c.md").read_text() == comparison_markdown(found)
+
+    def test_of_two_folders(self, fused: Path, call: Call) -> None:
+        assert call("run", "e.yaml", "--seed", "2", "--out", "other").code == 0
+        ended = call("compare", "out/e", "other", "--baseline", "e:coPEM", "--configurations", "e:PEM, other:PEM")
+        assert ended.code == 0
+        first, other = ([line.split()[1:] for line in ended.out.splitlines() if line.startswith(name)]
+                        for name in ("e:PEM ", "other:PEM "))  # fmt: skip
+        assert first == other != []
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["nowhere"], "nowhere: expected a results folder, found no such folder; `copem-replay run` writes one"),
+            (["e.yaml"], "e.yaml: expected a results folder, found a file; `copem-replay run` writes one"),
+            (["."], ".: expected a results folder, found no provenance.json in it; `copem-replay run` writes one"),
+            (["out/e", "--baseline", "coPEN"], "no configuration is named 'coPEN'; did you mean coPEM?"),
+            (["out/e", "--baseline", "GT", "--configurations", "PEN"], "no configuration is named 'PEN'"),
+            (["out/e", "--baseline", "GT", "--out", "c.txt"], "c.txt: expected a name that ends with .csv or .md"),
+        ],
+    )
+    def test_what_cannot_be_compared(self, fused: Path, call: Call, arguments: list[str], said: str) -> None:
+        ended = call("compare", *arguments)
+        assert (ended.code, ended.out) == (2, "")
+        (line,) = ended.lines
+        assert said in line
+        assert not (fused / "c.txt").exists()
+
+    def test_other_seeds_are_no_pairs(self, fused: Path, call: Call) -> None:
+        assert call("run", "e.yaml", "--seed", "3", "--out", "other").code == 0
+        ended = call("compare", "out/e", "other", "--baseline", "e:coPEM")
+        assert (ended.code, ended.out) == (2, "")
+        assert any("seed" in line for line in ended.lines)
 
 
 class TestTarget:
@@ -788,7 +860,7 @@ class TestFailure:
     def test_while_replaying(
         self, here: Path, call: Call, arguments: list[str], failure: Failure, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(run.replays, "replay_block", raising(failure.error))
+        monkeypatch.setattr(run.replays, "outcomes", raising(failure.error))
         self.fails(here, call, arguments, failure)
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])

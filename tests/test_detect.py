@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from copem_replay.detect import capture_instants, detect
-from copem_replay.experiment import Confirm
 from copem_replay.fusion.ideal import fuse
+from copem_replay.measure_keys import Confirm
 from copem_replay.onset import Looks
 from copem_replay.tracks import VALUES, Tracks
 

@@ -606,6 +606,22 @@ class TestRefused:
         )
         assert "no closed form" in refused(plan, recording(things, until_s=4.0))
 
+    @pytest.mark.parametrize(
+        ("changes", "measure"),
+        [
+            ({"configurations": {"all": {"units": "all"}, "gnn": {"units": "all", "fusion": {"kind": "gnn"}}}}, {}),
+            ({"configurations": {"union": {"units": "all", "fusion": {"kind": "union"}}}}, {}),
+            ({}, {"match": {"always": True}}),
+        ],
+    )
+    @pytest.mark.parametrize("confirm", [{"hits": 1, "of": 1}, {"hits": 2, "of": 2}])
+    def test_matches_by_the_library(
+        self, changes: dict[str, Any], measure: dict[str, Any], confirm: dict[str, int]
+    ) -> None:
+        """Which entry is about whom depends on sampled errors."""
+        asked = {"onset": {"kind": "appears"}, "exact": True, "confirm": confirm} | measure
+        assert "exact" in refused(masts(1, measure=asked, **changes), one_walker())
+
     def test_by_the_command(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -633,20 +649,21 @@ def checked(folder: Path, *changes: str) -> list[str]:
 
 @cache
 def replayed_file(name: str, **changes: Any) -> Result:
-    """An experiment of ours with its exact times; `confirm`: hits and of."""
+    """An experiment of ours with its exact times and without accuracy; `confirm`: hits and of."""
     source = load(ROOT / "logs" / f"{name}.yaml")
     confirm = changes.get("confirm")
-    source.data["measure"]["exact"] = True
+    source.data["measure"] |= {"exact": True, "accuracy": False}
     if confirm is not None:
         source.data["measure"]["confirm"] = {"hits": confirm[0], "of": confirm[1]}
     planned, found = problems(source)
-    assert planned is not None, found
+    assert not found
+    assert planned is not None
     recordings, refusals = read_logs(planned, log_paths(source)[0], source)
     assert not refusals
     return run(planned, recordings)
 
 
-CASES = {"tc016d": (None, 6), "tc016d 3 of 5": ((3, 5), 6), "crossing": (None, 9 * 21)}
+CASES = {"tc016d": (None, 6), "tc016d 3 of 5": ((3, 5), 6), "crossing_units": (None, 9 * 21)}
 """Files, how they confirm, and in how many pairs of configuration and object runs are compared."""
 RISK = 1e-6 / (sum(count for _, count in CASES.values()) + 6)
 """That any of all bands is left by chance, shared by all, 6 for the shares that pass."""
@@ -700,7 +717,7 @@ def test_the_runs_are_within_the_band_of_the_exact_distribution(case: str) -> No
 
 def test_the_summary_is_what_the_runs_tend_to() -> None:
     """Over all 21 objects of the crossing, which leave and are censored: within the bands of all of them together."""
-    result = replayed_file("crossing", confirm=None)
+    result = replayed_file("crossing_units", confirm=None)
     for row in result.summary.itertuples():
         assert row.detected_share_exact == pytest.approx(row.detected_share, abs=0.02)
         assert row.ttd_rmst_s_exact == pytest.approx(row.ttd_rmst_s, abs=0.2)

@@ -14,6 +14,9 @@ from copem_replay.components import Component
 from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, log_paths, parse
+from copem_replay.fusion.component import Ideal, Inbox, StepFusion
+from copem_replay.fusion.object_list import Entries
+from copem_replay.fusion.tracker import Tracker
 from copem_replay.pem.detection import Constant, DetectionModel, VisibleShare
 from copem_replay.pem.error import ErrorModel
 from copem_replay.pem.look import Look
@@ -66,6 +69,15 @@ class Always(DetectionModel):
 
 class NoModel(Component):
     pass
+
+
+class Newest(StepFusion):
+    """What the first unit says, and nobody else."""
+
+    surely: bool = True
+
+    def step(self, now_s: float, inbox: Inbox, memory: Any) -> tuple[Entries, Any]:
+        return inbox.newest[0].entries, None
 
 
 def experiment(folder: Path, text: str) -> Experiment:
@@ -266,6 +278,10 @@ TOP = "%s", ""
 WHEN = "    - when: {%s}", "7: pems.onboard[0].when"
 DETECTION = "      detection: {%s}", "8: pems.onboard[0].detection"
 ERROR = "      error: {%s}", "9: pems.onboard[0].error"
+EXISTENCE = (
+    "      error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]]}\n      existence: %s",
+    "10: pems.onboard[0].existence",
+)
 UNIT = "  ego: {%s}", "11: units.ego"
 MAST = "  mast: {%s}", "12: units.mast"
 PEM = "  PEM: %s", "15: configurations.PEM"
@@ -283,8 +299,11 @@ KEYS = (
     "version, visibility"
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"
+FUSIONS = "ideal, union, nms, gnn, tracker"
 ONSETS = "'starts_moving', 'appears', 'in_range', 'line_of_sight', 'line_of_sight_any', 'at'"
 KINDS = "expected {kind: …}, kind one of visible_share, constant, table; found "
+EITHER = "expected one of `pem: <name>` and `recorded: {topic: …}`"
+RECORDED = "recorded: goes with one place, `on` an object or `at` a point, and without rate_hz"
 PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`"
 CASES = [
     (TOP, "version: 2", "1: version: expected 1, found 2"),
@@ -346,6 +365,23 @@ CASES = [
      ".covariance_m2[0][0]: expected at most 1e+12, found 1e+308"),
     (ERROR, "kind: gaussian, covariance_m2: [[1, 0], [0, 1]], frame: body",
      ".frame: expected 'absolute' or 'line_of_sight', found 'body'"),
+    (EXISTENCE, "1.5", ": expected at most 1, or 'visible_share', found 1.5"),
+    (EXISTENCE, "sure", ": expected a number, or 'visible_share', found 'sure'"),
+    (UNIT, "on: ego", f": {EITHER}"),
+    (UNIT, "on: ego, pem: onboard, recorded: {topic: lists}", f": {EITHER}"),
+    (UNIT, "recorded: {topic: lists}, rate_hz: 5", f": {RECORDED}"),
+    (UNIT, "recorded: {topic: lists}, on: ego, at: [1, 2]", f": {RECORDED}"),
+    (UNIT, "recorded: {topic: lists}, on: {classes: [car], share: 0.5}", f": {RECORDED}"),
+    (UNIT, "recorded: lists", ".recorded: expected keys and values, found 'lists'"),
+    (UNIT, "recorded: {}", ".recorded.topic: missing"),
+    (UNIT, "recorded: {topic: ''}", ".recorded.topic: expected at least 1 character, found ''"),
+    (UNIT, "recorded: {topic: lists, delay: 1}", ".recorded.delay: unknown key; did you mean delay_s?"),
+    (UNIT, "recorded: {topic: lists, delay_s: -1, existence: 1.5, covariance_m2: [[1, 2], [2, 1]]}",
+     ".recorded.delay_s: expected at least 0, found -1",
+     ".recorded.covariance_m2: expected a positive semi-definite matrix, found [[1.0, 2.0], [2.0, 1.0]]",
+     ".recorded.existence: expected at most 1, found 1.5"),
+    (UNIT, "recorded: {topic: lists, existence: visible_share}",
+     ".recorded.existence: expected a number, found 'visible_share'"),
     (UNIT, "height_m: 1, pem: onboard", f": {PLACE}"),
     (UNIT, "on: ego, at: [0, 0], height_m: 1, pem: onboard", f": {PLACE}"),
     (UNIT, "on: ego, height_m: 1, pem: onboard, ground_z_m: 0",
@@ -408,9 +444,30 @@ CASES = [
      ".latency_s.ego: expected at least 0, found -1",
      ".latency_s.mast: expected a number, found 'x'"),
     (COPEM, "latncy_s: 1", ".latncy_s: unknown key; did you mean latency_s?"),
-    (COPEM, "fusion: ideal", ".fusion: expected keys and values, found 'ideal'"),
-    (COPEM, "fusion: {kind: real}", ".fusion.kind: expected 'ideal', found 'real'"),
+    (COPEM, "fusion: ideal", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found 'ideal'"),
+    (COPEM, "fusion: {kind: real}", f".fusion: kind: expected one of {FUSIONS}, or package.module:Class; found 'real'"),
     (COPEM, "fusion: {combine: mean}", ".fusion.combine: expected 'samples' or 'posterior', found 'mean'"),
+    (COPEM, "fusion: {colour: red}", ".fusion.colour: unknown key; known here: combine, kind"),
+    (COPEM, "fusion: {kind: ideal, colour: red}", ".fusion.colour: unknown key; known here: combine, kind"),
+    (COPEM, "fusion: {kind: 5}", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found {{'kind': 5}}"),
+    (COPEM, "fusion: null", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found nothing"),
+    (COPEM, "fusion: {kind: union, combine: samples}",
+     ".fusion.combine: unknown key; known here: kind, min_existence"),
+    (COPEM, "fusion: {kind: union, min_existence: 2}", ".fusion.min_existence: expected at most 1, found 2"),
+    (COPEM, "fusion: {kind: nms, by: size}", ".fusion.by: expected 'iou' or 'centre', found 'size'"),
+    (COPEM, "fusion: {kind: nms, radius: 2}", ".fusion.radius: unknown key; did you mean radius_m?"),
+    (COPEM, "fusion: {kind: gnn, combine: samples}",
+     ".fusion.combine: expected 'inverse_variance', 'covariance_intersection' or 'fast_covariance_intersection', found "
+     "'samples'"),
+    (COPEM, "fusion: {kind: gnn, gate: 1}", ".fusion.gate: expected less than 1, found 1"),
+    (COPEM, "fusion: {kind: tracker, late: never}",
+     ".fusion.late: expected 'stale', 'predict' or 'replay', found 'never'"),
+    (COPEM, "fusion: {kind: tracker, forget_s: 0, publish: 2, confirm_s: -1}",
+     ".fusion.forget_s: expected more than 0, found 0",
+     ".fusion.publish: expected at most 1, found 2",
+     ".fusion.confirm_s: expected at least 0, found -1"),
+    (COPEM, "fusion: {kind: tracker, publish: 0.1, drop: 0.5}",
+     ".fusion: drop: expected at most publish (0.1), found 0.5"),
     (TOP, "measure: []", "17: measure: expected keys and values, found []"),
     (MEASURE, "objects: {classes: [car], ids: [1]}", ".objects: expected either classes or ids, found both"),
     (MEASURE, "objects: {ids: []}", ".objects.ids: expected at least 1 in the list, found []"),
@@ -428,6 +485,16 @@ CASES = [
     (MEASURE, "confirm: {hits: 3, of: 2}", ".confirm: expected hits ≤ of, found 3 of 2"),
     (MEASURE, "confirm: {hits: 0}", ".confirm.hits: expected at least 1, found 0"),
     (MEASURE, "horizon_s: 0", ".horizon_s: expected more than 0, found 0"),
+    (MEASURE, "match: 3", ".match: expected keys and values, found 3"),
+    (MEASURE, "match: {gate_m: 0}", ".match.gate_m: expected more than 0, found 0"),
+    (MEASURE, "match: {gate: 3}", ".match.gate: unknown key; did you mean gate_m?"),
+    (MEASURE, "match: {always: 1}", ".match.always: expected true or false, found 1"),
+    (MEASURE, "accuracy: yes", ".accuracy: expected true or false, found 'yes'"),
+    (MEASURE, "gospa: {power: 0.5}", ".gospa.power: expected at least 1, found 0.5"),
+    (MEASURE, "gospa: {power: 11, cutoff_m: 0}",
+     ".gospa.cutoff_m: expected more than 0, found 0",
+     ".gospa.power: expected at most 10, found 11"),
+    (MEASURE, "gospa: {p: 2}", ".gospa.p: unknown key; known here: cutoff_m, power"),
     (OBSTACLES, "{}", ": expected a list, found {}"),
     (OBSTACLES, "[{polygon_m: [[0, 0], [1, 1]], height_m: 1}]",
      "[0].polygon_m: expected at least 3 in the list, found [[0, 0], [1, 1]]"),
@@ -438,6 +505,9 @@ CASES = [
     (SHOW, "{logs: first}", ".logs: expected a list, found 'first'"),
     (SHOW, "{logs: []}", ".logs: expected at least 1 in the list, found []"),
     (SHOW, "{run: best}", ".run: expected a whole number, or 'median' or 'worst', found 'best'"),
+    (SHOW, "{configurations: GT}", ".configurations: expected a list, found 'GT'"),
+    (SHOW, "{configurations: []}", ".configurations: expected at least 1 in the list, found []"),
+    (SHOW, "{configuration: [GT]}", ".configuration: unknown key; did you mean configurations?"),
     (SHOW, "{run: -1}", ".run: expected at least 0, or 'median' or 'worst', found -1"),
 ]  # fmt: skip
 
@@ -560,6 +630,25 @@ class TestComponents:
         (problem,) = problems(tmp_path, changed(at(ERROR, "kind: 'copem_replay.pem.detection:VisibleShare'")))
         assert f"is no kind of {ErrorModel.__module__}.ErrorModel" in problem
 
+    def test_fusion(self, tmp_path: Path) -> None:
+        """Ideal fusion needs no name; a class of one's own is named like that of a model."""
+        kind = f"{__name__}:Newest"
+        for text, expected in (
+            ("", Ideal()),
+            ("fusion: {}", Ideal()),
+            ("fusion: {combine: posterior}", Ideal(combine="posterior")),
+            ("fusion: {kind: tracker, late: replay}", Tracker(late="replay")),
+            (f"fusion: {{kind: '{kind}', surely: false}}", Newest(kind=kind, surely=False)),
+        ):
+            assert experiment(tmp_path, changed(at(COPEM, text))).configurations["coPEM"].fusion == expected
+        (problem,) = problems(tmp_path, changed(at(COPEM, f"fusion: {{kind: '{__name__}:Always'}}")))
+        assert "is no kind of copem_replay.fusion.component.Fusion" in problem
+
+    def test_the_schema_asks_for_the_kind_of_all_but_ideal_fusion(self) -> None:
+        fusion = Experiment.model_json_schema()["$defs"]["Configuration"]["properties"]["fusion"]
+        kinds = {one["properties"]["kind"].get("const"): "kind" in one.get("required", ()) for one in fusion["anyOf"]}
+        assert kinds == {"ideal": False, "union": True, "nms": True, "gnn": True, "tracker": True, None: True}
+
     def test_a_component_can_be_given_as_it_is(self) -> None:
         model = VisibleShare()
         data = {"version": 1, "logs": ["a"], "configurations": {"GT": {"units": "truth"}}}
@@ -610,9 +699,13 @@ class TestLogs:
         assert self.paths(tmp_path, name) == ([name], [])
 
 
+LOGS = Path(__file__).parents[1] / "logs"
+
+
 class TestRoundTrip:
     @pytest.mark.parametrize(
-        "text", [TEXT, CONTRACT, (Path(__file__).parents[1] / "logs/tc016d.yaml").read_text("utf-8")]
+        "text",
+        [TEXT, CONTRACT, *((LOGS / f"{name}.yaml").read_text("utf-8") for name in ("tc016d", "crossing"))],
     )
     def test_written_with_all_defaults_it_is_the_same(self, tmp_path: Path, text: str) -> None:
         first = experiment(tmp_path, text)
@@ -627,23 +720,33 @@ class TestRoundTrip:
         own_rate = "offset_m: [2, -0.5], rate_hz: 12.5, phase_s: 0.01, yaw_deg: -90"
         late = "fusion: {combine: posterior}, latency_s: {ego: 0, default: 0.25}, max_age_s: 3"
         onset = "onset: {kind: starts_moving, from: front, within_m: 20}"
+        matched = "match: {gate_m: 2.5, always: true}, accuracy: false, gospa: {cutoff_m: 7, power: 1}"
+        recorded = "topic: /lists, delay_s: 0.07, covariance_m2: [[0.5, 0.1], [0.1, 0.5]], existence: 0.8"
+        tracker = "{kind: tracker, late: replay, buffer_s: 1.5, publish: 0.6}"
         text = changed(
             at(DETECTION, f"kind: table, {table}"),
-            at(ERROR, f"kind: gaussian, covariance_m2: [[0.3, 0.1], [0.1, 0.4]], {more}"),
+            at(ERROR, f"kind: gaussian, covariance_m2: [[0.3, 0.1], [0.1, 0.4]], {more}")
+            + "\n      existence: visible_share",
             at(UNIT, f"on: ego, height_m: 1.8, pem: onboard, {own_rate}"),
             at(MAST, "at: [1e5, -2.25], height_m: 5, pem: onboard, ground_z_m: 31.4"),
             at(COPEM, late),
-            at(MEASURE, f"{onset}, confirm: {{hits: 2, of: 3}}, horizon_s: 5, count_earlier: true"),
+            at(PEM, f"{{units: [ego, cameras], fusion: {tracker}}}"),
+            at(MEASURE, f"{onset}, confirm: {{hits: 2, of: 3}}, horizon_s: 5, count_earlier: true, {matched}"),
             at(OBSTACLES, "[{polygon_m: [[0, 0], [4, 0], [4, 3]], height_m: 6, ground_z_m: -1}]"),
-            at(SHOW, "{logs: [first, 7], run: median}"),
+            at(SHOW, "{logs: [first, 7], run: median, configurations: [GT, coPEM]}"),
             "ego: 'on'",
             "read: {topic: /a b/ü}",
-        )
+        ).replace("configurations:", f"  cameras: {{on: 67, recorded: {{{recorded}}}}}\nconfigurations:", 1)
         first = experiment(tmp_path, text)
         assert experiment(tmp_path, plain_yaml.dump(first.as_written())) == first
         assert first.ego == "on"
         assert first.show is not None
         assert first.show.logs == ("first", "7")
+        assert list(first.shown()) == ["GT", "coPEM"]
+        assert list(first.recorded) == ["cameras"]
+        assert list(first.modelled) == ["ego", "mast"]
+        assert first.units_of(first.configurations["coPEM"]) == ("ego", "mast"), "recorded ones are named"
+        assert first.units_of(first.configurations["PEM"]) == ("ego", "cameras")
 
     def test_own_component(self, tmp_path: Path) -> None:
         first = experiment(tmp_path, changed(at(DETECTION, f"kind: '{__name__}:Always', sure: false")))

@@ -27,9 +27,10 @@ import scenes
 from copem_replay import cli
 from copem_replay.braking.encounter import EgoCourse
 from copem_replay.check import problems
-from copem_replay.experiment import Conflict, Experiment
+from copem_replay.experiment import Experiment
 from copem_replay.foresee import _will_be_in, corridors
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
+from copem_replay.measure_keys import Conflict
 from copem_replay.read import Recording
 from copem_replay.replay import believed, prepare, replay_block
 from copem_replay.run import run

@@ -17,7 +17,7 @@ from scipy import stats
 from copem_replay.candidates import candidates
 from copem_replay.experiment import Experiment
 from copem_replay.fusion.ideal import draw_posterior, fuse
-from copem_replay.fusion.inbox import inbox
+from copem_replay.fusion.instants import instants
 from copem_replay.perceive import perceive
 from copem_replay.read import Recording
 from copem_replay.tracks import UNCERTAINTIES, VALUES, Tracks
@@ -469,7 +469,7 @@ class TestStaleLists:
     def test_nothing_heard_at_all(self) -> None:
         assert issued(heard({"a": [], "b": []})) == []
         assert issued(heard({"a": []})) == []
-        assert inbox(heard({"a": []}), max_age_s=1.0).issue_s.tolist() == []
+        assert instants(heard({"a": []}), max_age_s=1.0).issue_s.tolist() == []
 
 
 TICK = 10

@@ -22,11 +22,12 @@ import pytest
 from copem_replay.colours import configuration_colours
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
+from copem_replay.fusion.belief import Belief
 from copem_replay.replay import Replay, believed, prepare, replay_block
 from copem_replay.show import write_rrd
 from copem_replay.show.out import ELAPSED, TIME
 from copem_replay.show.recording import latest_known
-from copem_replay.tracks import CLASSES, Tracks
+from copem_replay.tracks import CLASSES
 from scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
 os.environ["RERUN_ANALYTICS"] = "0"  # before it is imported, which is when something is written
@@ -75,7 +76,7 @@ class Made:
     path: Path
     replay: Replay
     given: Experiment
-    beliefs: dict[str, Tracks]
+    beliefs: dict[str, Belief]
     table: pd.DataFrame
 
     def write(self, path: Path, **changes: Any) -> None:
@@ -86,7 +87,7 @@ class Made:
 def make(path: Path, scene: Any, **changes: Any) -> Made:
     given = experiment(**changes)
     replay = prepare(scene, given)
-    beliefs = {name: belief.fused for name, belief in believed(replay, given, 3).items()}
+    beliefs = believed(replay, given, 3)
     made = Made(path, replay, given, beliefs, replay_block(replay, given, np.array([3])))
     made.write(path)
     return made
@@ -145,7 +146,7 @@ def float32(*columns: Any) -> list[list[float]]:
 
 @pytest.mark.parametrize("name", ["truth", *CHANGES["configurations"]])
 def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
-    tracks = made.replay.truth if name == "truth" else made.beliefs[name]
+    tracks = made.replay.truth if name == "truth" else made.beliefs[name].fused
     entity = f"/world/{name}/boxes".replace(" ", "\\ ")
     found = rows(made.path, entity)
     assert [row[ELAPSED] for row in found] == np.rint(tracks.arrives_s[0] * 1e9).astype(int).tolist()
@@ -247,8 +248,9 @@ def test_errors_are_those_of_the_instant_a_list_is_available(made: Made) -> None
     assert (late[0][ELAPSED], late[-1][ELAPSED]) == (500_000_000, 4_000_000_000)  # at 4.5 s it has left
     once = rows(made.path, "/plots/position_error/7/PEM")
     assert [row[ELAPSED] for row in once] == [4_000_000_000]
-    [seen] = np.flatnonzero((made.beliefs["PEM"].row_object_ix == 1) & made.beliefs["PEM"].valid[0])
-    x, y = made.beliefs["PEM"].x_m[0, seen], made.beliefs["PEM"].y_m[0, seen]
+    fused = made.beliefs["PEM"].fused
+    [seen] = np.flatnonzero((fused.row_object_ix == 1) & fused.valid[0])
+    x, y = fused.x_m[0, seen], fused.y_m[0, seen]
     assert once[0]["Scalars:scalars"] == [np.hypot(x - 60, y)]
     assert not rows(made.path, "/plots/position_error/7/none")
 
@@ -419,7 +421,7 @@ def test_at_most_forty_bytes_a_box(tmp_path: Path) -> None:
         tmp_path / "x.rrd", recording(things, until_s=30.0), pems=CHANGES["pems"], configurations=names,
         units={"ego": EGO_UNIT | {"pem": "all"}, "pole": CHANGES["units"]["pole"] | {"rate_hz": None}},
     )  # fmt: skip
-    boxes = len(made.replay.truth.frame_ix) + sum(int(tracks.valid.sum()) for tracks in made.beliefs.values())
+    boxes = len(made.replay.truth.frame_ix) + sum(int(belief.fused.valid.sum()) for belief in made.beliefs.values())
     assert boxes > 70_000
     assert made.path.stat().st_size <= 40 * boxes
 

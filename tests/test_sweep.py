@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 
 from copem_replay import cli
+from copem_replay.accuracy import FIGURES
 from copem_replay.check import problems, read_logs
 from copem_replay.errors import ExperimentError
 from copem_replay.exact import exact_table
@@ -208,6 +209,19 @@ class TestPoints:
         (point,) = points(plan({"units": [1]}, measure=measure, braking=None))
         assert point.experiment.measure.conflict is None
 
+    def test_accuracy_never_is(self) -> None:
+        assert plan().measure.accuracy
+        found = only(plan(EVERYTHING))
+        assert len(found) > 3
+        assert not any(point.experiment.measure.accuracy for point in found)
+
+    def test_the_rate_of_what_was_recorded_stays(self) -> None:
+        units = {"ego": UNITS["ego"], "r": {"recorded": {"topic": "lists"}}}
+        both = {"both": {"units": ["ego", "r"]}, "recorded": {"units": ["r"]}}
+        (point,) = only(plan({"rate_hz": [4]}, units=units, configurations=both, measure={}))
+        assert {name: unit.rate_hz for name, unit in point.experiment.units.items()} == {"ego": 4, "r": None}
+        assert list(point.experiment.configurations) == ["both"]
+
     @pytest.mark.parametrize(
         "configuration",
         [
@@ -235,9 +249,13 @@ def rows_at(table: pd.DataFrame, sweep: str, value: float) -> pd.DataFrame:
 
 
 def plainly(names: list[str], **changes: Any) -> pd.DataFrame:
-    """The summary of the experiment as it would be written with that value."""
-    found = run(plan(**changes), [crossing()]).summary
+    """The summary of the experiment as it would be written with that value, but for accuracy."""
+    found = without_accuracy(run(plan(**changes), [crossing()]).summary)
     return found.set_index("configuration").loc[names].reset_index()
+
+
+def without_accuracy(summary: pd.DataFrame) -> pd.DataFrame:
+    return summary.drop(columns=list(FIGURES))
 
 
 def alike(found: pd.DataFrame, expected: pd.DataFrame) -> None:
@@ -357,7 +375,7 @@ def test_a_sweep_of_several_logs() -> None:
     found = run(plan({"latency_s": [0.4]}), logs).sweep
     assert found is not None
     late = {name: c | {"latency_s": 0.4} for name, c in CONFIGURATIONS.items() if name in ("all", "PEM")}
-    expected = run(plan(configurations=late), logs).summary
+    expected = without_accuracy(run(plan(configurations=late), logs).summary)
     part = rows_at(found, "latency_s", 0.4)
     alike(part[part["configuration"].isin(["PEM", "all"])].reset_index(drop=True), expected)
 
@@ -400,7 +418,9 @@ class TestFiles:
             summary = list(csv.reader(file))
         with (folder / "sweep.csv").open(newline="") as file:
             header, *lines = list(csv.reader(file))
-        assert header == ["sweep", "value", *summary[0]]
+        kept = [k for k, name in enumerate(summary[0]) if name not in FIGURES]
+        assert len(kept) == len(summary[0]) - len(FIGURES)
+        assert header == ["sweep", "value", *(summary[0][k] for k in kept)]
         assert "ttd_rmst_s_exact" in header
         assert [(row[0], row[1], row[2]) for row in lines] == [
             ("latency_s", "0", "PEM"), ("latency_s", "0", "coPEM"), ("latency_s", "0.25", "PEM"),
@@ -409,7 +429,7 @@ class TestFiles:
             ("units", "0", "coPEM"), ("units", "1", "coPEM"),
         ]  # fmt: skip
         # At the values the experiment has itself: the rows of its summary.
-        by_name = {row[0]: row for row in summary[1:]}
+        by_name = {row[0]: [row[k] for k in kept] for row in summary[1:]}
         assert lines[0][2:] == by_name["PEM"]
         assert lines[-1][2:] == by_name["coPEM"]
 
@@ -421,9 +441,9 @@ class TestFiles:
         call("run", "without.yaml", "--out", "b")
         assert (tmp_path / "a" / "sweep.csv").exists()
         assert not (tmp_path / "b" / "sweep.csv").exists()
-        names = ("detections.parquet", "summary.csv", "exact.parquet")
+        names = {path.name for path in (tmp_path / "b").iterdir()} - {"experiment.yaml", "provenance.json"}
+        assert {"detections.parquet", "summary.csv", "exact.parquet", "accuracy.parquet", "bands.csv"} < names
         assert written(tmp_path / "a", *names) == written(tmp_path / "b", *names)
-        assert len(written(tmp_path / "a", *names)) == 3
 
     def test_jobs_do_not_matter(self, call: Call, tmp_path: Path) -> None:
         fleet = "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}"
@@ -434,6 +454,7 @@ class TestFiles:
         first = written(tmp_path / "a")
         assert set(first) == {
             "detections.parquet", "exact.parquet", "experiment.yaml", "provenance.json", "summary.csv", "sweep.csv",
+            "bands.csv", "lists.parquet", "thresholds.parquet",
         }  # fmt: skip
         assert first == written(tmp_path / "b")
 

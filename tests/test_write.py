@@ -22,7 +22,7 @@ from copem_replay.check import problems, read_logs
 from copem_replay.errors import OutputError, RecordingError
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, log_paths
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
 from copem_replay.lists import read_lists
 from copem_replay.read import read
 from copem_replay.replay import Replay, believed, prepare, replay_block

@@ -2,6 +2,7 @@
 
 One message per list on `copem/<configuration>/detail`: the full covariance and variances of each object, the entries of
 the units' lists it was made of (parallel lists of unit, capture, range, visible share), and what was detected with it.
+Of a fusion without truth ids: what it claims of the existence, and no entries.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
 from copem_replay.tracks import UNCERTAINTIES, Scene
 
 SCHEMA = "copem_replay.ListDetail"
@@ -30,6 +31,7 @@ JSON_SCHEMA = {
                 "type": "object",
                 "properties": {
                     "id": {"type": "string"},
+                    "existence": {"type": "number"},
                     **dict.fromkeys(UNCERTAINTIES, _NUMBER),
                     "units": {"type": "array", "items": {"type": "string"}},
                     "captured_ns": {"type": "array", "items": {"type": "integer"}},
@@ -52,7 +54,7 @@ class DetailWriter:
     def __init__(self, scene: Scene, belief: Belief, events: Mapping[int, Sequence[Event]]) -> None:
         fused, heard, used = belief.fused, belief.heard, belief.used
         self._fused, self._listed, self._events = fused, belief.listed, events
-        self._ids = [scene.object_ids[k] for k in fused.row_object_ix]
+        self._ids = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
         self._variances = {
             name: [None] * len(fused.frame_ix) if (a := getattr(fused, name)) is None else a[0].tolist()
             for name in UNCERTAINTIES
@@ -65,6 +67,7 @@ class DetailWriter:
             "visible_share": nothing if belief.look is None else belief.look.visible_share[used].tolist(),
         }
         self._start = belief.used_start.tolist()
+        self._said = belief.said
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
@@ -78,8 +81,10 @@ class DetailWriter:
 
     def _object(self, row: int) -> dict[str, Any]:
         first, last = self._start[row], self._start[row + 1]
+        claimed = {} if self._said is None else {"existence": float(self._said["existence"][row])}
         return {
             "id": self._ids[row],
+            **claimed,
             **{name: values[row] for name, values in self._variances.items()},
             **{name: values[first:last] for name, values in self._entries.items()},
         }

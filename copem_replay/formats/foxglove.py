@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from copem_replay.colours import Rgb
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
 from copem_replay.tracks import CLASSES, Scene
 
 SCHEMA = "foxglove.SceneUpdate"
@@ -32,9 +32,11 @@ class SceneWriter:
     def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb) -> None:
         fused = belief.fused
         self._listed = belief.listed
-        self._object_ix = fused.row_object_ix.tolist()
         # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
-        self._prototype = [_prototype(scene, k, configuration, colour) for k in range(len(scene.object_ids))]
+        names = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
+        kinds = belief.class_of(scene).tolist()
+        made = {key: _prototype(*key, configuration, colour) for key in dict.fromkeys(zip(names, kinds, strict=True))}
+        self._prototype = [made[key] for key in zip(names, kinds, strict=True)]
         half = fused.yaw_rad[0] / 2
         columns = [getattr(fused, n)[0] for n in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")]
         self._values = list(zip(*(c.tolist() for c in (*columns, np.sin(half), np.cos(half))), strict=True))
@@ -49,7 +51,7 @@ class SceneWriter:
         deletion.timestamp.FromNanoseconds(available_ns)
         for row in self._listed(frame):
             entity = update.entities.add()
-            entity.CopyFrom(self._prototype[self._object_ix[row]])
+            entity.CopyFrom(self._prototype[row])
             entity.timestamp.CopyFrom(deletion.timestamp)
             cube = entity.cubes[0]
             at, turn, size = cube.pose.position, cube.pose.orientation, cube.size
@@ -58,15 +60,15 @@ class SceneWriter:
         return encoded
 
 
-def _prototype(scene: Scene, number: int, configuration: str, colour: Rgb) -> Any:
+def _prototype(name: str, class_ix: int, configuration: str, colour: Rgb) -> Any:
     """A box with all that its object and its configuration say."""
     from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 
-    entity = SceneEntity(frame_id=FRAME_ID, id=scene.object_ids[number])
+    entity = SceneEntity(frame_id=FRAME_ID, id=name)
     for key, text in (
         ("configuration", configuration),
-        ("class", CLASSES[scene.object_class[number]]),
-        ("object", scene.object_ids[number]),
+        ("class", CLASSES[class_ix]),
+        ("object", name),
     ):
         entity.metadata.add(key=key, value=text)
     color = entity.cubes.add().color

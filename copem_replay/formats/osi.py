@@ -60,6 +60,13 @@ _LAST_SECOND = 4_000_000_000  # chosen: Unix time of 2096; differences of stamps
 _NAN = float("nan")
 
 
+def class_of(kind: int, vehicle: int | None) -> int:
+    """Index into CLASSES of a MovingObject's type and, where it says one, vehicle classification type."""
+    if kind != _IS_VEHICLE:
+        return _CLASS_OF_TYPE.get(kind, OTHER)
+    return VEHICLE if vehicle is None else _CLASS_OF_VEHICLE.get(vehicle, VEHICLE)
+
+
 class Decoder:
     """Collects messages of one topic: `add` each payload, then take `columns`."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from copem_replay.chance import object_words
-from copem_replay.fusion.ideal import Belief
+from copem_replay.fusion.belief import Belief
 from copem_replay.tracks import CLASSES, VALUES, Float, Scene
 
 SCHEMA = "osi3.SensorData"
@@ -58,17 +58,28 @@ class SensorDataWriter:
     def __init__(self, scene: Scene, belief: Belief, unit_numbers: Mapping[str, int]) -> None:
         fused = belief.fused
         self._fused, self._listed = fused, belief.listed
-        self._moving = scene.moving[fused.row_object_ix].tolist()
-        self._object_ix = fused.row_object_ix.tolist()
+        object_ix, said = fused.row_object_ix, belief.said
+        self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True).tolist()
         # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
-        self._prototype = [_prototype(scene, number) for number in range(len(scene.object_ids))]
+        if said is None:
+            by_object = [_prototype(scene, number) for number in range(len(scene.object_ids))]
+            self._prototype = [by_object[number] for number in object_ix]
+        else:
+            self._prototype = [_claimed(scene, k, entry) for k, entry in zip(object_ix.tolist(), said, strict=True)]
         self._values = list(zip(*(getattr(fused, name)[0].tolist() for name in VALUES), strict=True))
         spread = ("cov_ee_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
         self._sigma = list(zip(*(_sigma(getattr(fused, name), len(fused.frame_ix)) for name in spread), strict=True))
         heard = belief.heard
-        self._unit = np.array([unit_numbers[name] for name in heard.units])[heard.row_unit_ix[belief.used]].tolist()
-        self._captured_ns = heard.stamp_ns[heard.frame_ix[belief.used]].tolist()
-        self._used_start = belief.used_start.tolist()
+        numbers = np.array([unit_numbers[name] for name in heard.units])
+        if said is None:
+            self._unit = numbers[heard.row_unit_ix[belief.used]].tolist()
+            self._captured_ns = heard.stamp_ns[heard.frame_ix[belief.used]].tolist()
+            self._used_start = belief.used_start.tolist()
+        else:  # of what contributed, only the first unit and the newest capture are said
+            known = said["unit_ix"] >= 0
+            self._unit = numbers[said["unit_ix"][known]].tolist()
+            self._captured_ns = (scene.t0_ns + np.rint(said["captured_s"][known] * 1e9).astype(np.int64)).tolist()
+            self._used_start = np.concatenate([[0], np.cumsum(known)]).tolist()
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
@@ -86,7 +97,7 @@ class SensorDataWriter:
 
     def _add(self, items: Any, row: int, captured_ns: int) -> None:
         item = items.add()
-        item.CopyFrom(self._prototype[self._object_ix[row]])
+        item.CopyFrom(self._prototype[row])
         header, base, spread = item.header, item.base, item.base_rmse
         first, last = self._used_start[row], self._used_start[row + 1]
         sensors = header.sensor_id
@@ -118,6 +129,26 @@ def _prototype(scene: Scene, number: int) -> Any:
         candidate = item.candidate.add()
         candidate.probability = 1.0
         candidate.type, vehicle = _OSI_TYPE[CLASSES[scene.object_class[number]]]
+        if vehicle is not None:
+            candidate.vehicle_classification.type = vehicle
+    return item
+
+
+def _claimed(scene: Scene, number: int, entry: Any) -> Any:
+    """A detected object as a fusion without truth ids lists it; `number` of the object it was matched with, or −1."""
+    from osi3.osi_detectedobject_pb2 import DetectedMovingObject, DetectedStationaryObject
+
+    moving = number < 0 or bool(scene.moving[number])
+    item = DetectedMovingObject() if moving else DetectedStationaryObject()
+    if entry["track_id"] >= 0:
+        item.header.tracking_id.value = int(entry["track_id"])
+    if number >= 0:
+        item.header.ground_truth_id.add().value = osi_id(scene.object_ids[number])
+    item.header.existence_probability = float(entry["existence"])
+    for index in np.flatnonzero(entry["class_probability"]) if moving else ():
+        candidate = item.candidate.add()
+        candidate.probability = float(entry["class_probability"][index])
+        candidate.type, vehicle = _OSI_TYPE[CLASSES[index]]
         if vehicle is not None:
             candidate.vehicle_classification.type = vehicle
     return item

@@ -1,1 +1,10 @@
 """Fusion: what the receiver believes, from the lists that have arrived (f of the paper's coPEM)."""
+
+FUSIONS = {
+    "ideal": "copem_replay.fusion.component:Ideal",
+    "union": "copem_replay.fusion.union:Union",
+    "nms": "copem_replay.fusion.nms:Nms",
+    "gnn": "copem_replay.fusion.gnn:Gnn",
+    "tracker": "copem_replay.fusion.tracker:Tracker",
+}
+"""Built-in names of `fusion: {kind: …}`."""

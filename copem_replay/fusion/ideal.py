@@ -7,50 +7,18 @@ paper leaves open is combined by inverse variance as well: yaw on the circle, si
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numba as nb
 import numpy as np
 
 from copem_replay.chance import Address, Dice, object_words
-from copem_replay.fusion.inbox import inbox
-from copem_replay.pem.look import Look
+from copem_replay.fusion.belief import Belief
+from copem_replay.fusion.instants import instants
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
 
 SMALLEST_VARIANCE = 1e-9
 """A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
-
-
-@dataclass(frozen=True)
-class Belief:
-    """What the receiver believes in one run, and which entries of the units' lists each fused row was made of."""
-
-    fused: Tracks
-    heard: Tracks
-    entries: Int  # (C,) rows of `heard`, those that were not detected too
-    start: Int  # (P + 1,) where the entries of each fused row begin
-    look: Look | None = None  # how the rows of `heard` look from their units; the truth needs none
-
-    @cached_property
-    def used(self) -> Int:
-        """The entries that were detected, (C',) rows of `heard`, grouped by `used_start`."""
-        detected: Bool = self.heard.valid[0, self.entries]
-        return self.entries[detected]
-
-    @cached_property
-    def used_start(self) -> Int:
-        """(P + 1,) where the detected entries of each fused row begin."""
-        before: Int = np.concatenate([[0], np.cumsum(self.heard.valid[0, self.entries])])
-        starts: Int = before[self.start]
-        return starts
-
-    def listed(self, frame: int) -> list[int]:
-        """Rows of `fused` that are in one list."""
-        order, bounds = self.fused.by_frame
-        rows = order[bounds[frame] : bounds[frame + 1]]
-        result: list[int] = rows[self.fused.valid[0, rows]].tolist()
-        return result
 
 
 def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Belief:
@@ -60,25 +28,26 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Bel
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
     `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
     """
-    box = inbox(heard, max_age_s=max_age_s)
-    rows, start, object_ix, instant = _contributions(heard, box.newest, without_object_ix)
+    at = instants(heard, max_age_s=max_age_s)
+    rows, start, object_ix, instant = _contributions(heard, at.newest, without_object_ix)
     valid = _any(heard.valid, rows, start)
     ee, en, nn = _information(heard)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     _combine_position(
-        heard.valid, _per_run(heard, heard.x_m), _per_run(heard, heard.y_m), ee, en, nn, rows, start,
+        heard.valid, heard.x_m, heard.y_m, ee, en, nn, rows, start,
         out["x_m"], out["y_m"], out["cov_ee_m2"], out["cov_en_m2"], out["cov_nn_m2"],
     )  # fmt: skip
+    spread = {}
     for name, variance in (
         ("z_m", None), ("length_m", "size_var_m2"), ("width_m", "size_var_m2"), ("height_m", "size_var_m2"),
         ("vx_mps", "speed_var_m2ps2"), ("vy_mps", "speed_var_m2ps2"),
     ):  # fmt: skip
-        out[name] = _combine(heard, getattr(heard, name), variance, rows, start)[0]
+        out[name], spread[variance] = _combine(heard, getattr(heard, name), variance, rows, start)
     yaw = np.asarray(heard.yaw_rad)
     sin, yaw_variance = _combine(heard, np.sin(yaw), "yaw_var_rad2", rows, start)
     out["yaw_rad"] = np.arctan2(sin, _combine(heard, np.cos(yaw), "yaw_var_rad2", rows, start)[0])
-    captured = np.where(box.newest >= 0, heard.captured_s[box.newest], -np.inf).max(axis=1, initial=-np.inf)
-    stamps = np.where(box.newest >= 0, heard.stamp_ns[box.newest], np.iinfo(np.int64).min).max(axis=1)
+    captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
+    stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], np.iinfo(np.int64).min).max(axis=1)
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
     fused = Tracks(
         units=("fused",),
@@ -88,12 +57,12 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Bel
         frame_ix=instant,
         stamp_ns=stamps,
         captured_s=captured,
-        frame_unit_ix=np.zeros(len(box.issue_s), dtype=np.int64),
-        arrives_s=box.issue_s[None],
+        frame_unit_ix=np.zeros(len(at.issue_s), dtype=np.int64),
+        arrives_s=at.issue_s[None],
         valid=valid,
         yaw_var_rad2=yaw_variance,
-        size_var_m2=_combine(heard, heard.z_m, "size_var_m2", rows, start)[1],
-        speed_var_m2ps2=_combine(heard, heard.z_m, "speed_var_m2ps2", rows, start)[1],
+        size_var_m2=spread["size_var_m2"],
+        speed_var_m2ps2=spread["speed_var_m2ps2"],
         **out,
     )
     return Belief(fused, heard, rows, start)
@@ -119,7 +88,10 @@ def draw_posterior(belief: Belief, scene: Scene, seed: int, runs: Int) -> Belief
 
 
 def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[Int, Int, Int, Int]:
-    """Which rows of `heard` make each fused row, grouped: rows (C,), start (P + 1,), object and instant (P,)."""
+    """Which rows of `heard` make each fused row, grouped: rows (C,), start (P + 1,), object and instant (P,).
+
+    Entries without truth id (of recorded units) are in none.
+    """
     order, bounds = heard.by_frame
     instant, _unit = np.nonzero(newest >= 0)
     frame = newest[newest >= 0]
@@ -128,7 +100,7 @@ def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[
     rows = order[np.repeat(bounds[frame], count) + within]
     instant = np.repeat(instant, count)
     object_ix = heard.row_object_ix[rows]
-    keep = object_ix != without_object_ix
+    keep = (object_ix != without_object_ix) & (object_ix >= 0)
     rows, instant, object_ix = rows[keep], instant[keep], object_ix[keep]
     by = np.lexsort((heard.row_unit_ix[rows], instant, object_ix))
     rows, instant, object_ix = rows[by], instant[by], object_ix[by]
@@ -137,22 +109,28 @@ def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[
 
 
 def _information(heard: Tracks) -> tuple[Float, Float, Float]:
-    """Inverse position covariances (1 | S, P), eigenvalues floored at SMALLEST_VARIANCE."""
-    none = np.zeros((1, len(heard.frame_ix)))
-    a, b, d = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
-    half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
-    high, low = half + turn, half - turn
-    # Along the eigenvectors: cos 2φ and sin 2φ of the larger one.
-    c2 = np.where(turn > 0, (a - d) / 2 / np.where(turn > 0, turn, 1), 1.0)
-    s2 = np.where(turn > 0, b / np.where(turn > 0, turn, 1), 0.0)
-    ih, il = 1 / np.maximum(high, SMALLEST_VARIANCE), 1 / np.maximum(low, SMALLEST_VARIANCE)
-    mean, difference = (ih + il) / 2, (ih - il) / 2
+    """Inverse position covariances ee, en, nn (1 | S, P)."""
+    high, low, c2, s2 = _axes(heard)
+    mean, difference = (1 / high + 1 / low) / 2, (1 / high - 1 / low) / 2
     return mean + difference * c2, difference * s2, mean - difference * c2
 
 
-def _per_run(heard: Tracks, values: Float) -> Float:
-    """Values with a row per run, as the kernels want them."""
-    return values if len(values) == len(heard.valid) else np.repeat(values, len(heard.valid), axis=0)
+def floored(heard: Tracks) -> tuple[Float, Float, Float]:
+    """Position covariances ee, en, nn (1 | S, P), their eigenvalues no smaller than SMALLEST_VARIANCE."""
+    high, low, c2, s2 = _axes(heard)
+    mean, difference = (high + low) / 2, (high - low) / 2
+    return mean + difference * c2, difference * s2, mean - difference * c2
+
+
+def _axes(heard: Tracks) -> tuple[Float, Float, Float, Float]:
+    """Eigenvalues of position covariances, floored, larger first; cos 2φ and sin 2φ of the larger one's direction φ."""
+    none = np.zeros((1, len(heard.frame_ix)))
+    a, b, d = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
+    half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
+    high, low = np.maximum(half + turn, SMALLEST_VARIANCE), np.maximum(half - turn, SMALLEST_VARIANCE)
+    c2 = np.where(turn > 0, (a - d) / 2 / np.where(turn > 0, turn, 1), 1.0)
+    s2 = np.where(turn > 0, b / np.where(turn > 0, turn, 1), 0.0)
+    return high, low, c2, s2
 
 
 def _combine(heard: Tracks, values: Float, variance: str | None, rows: Int, start: Int) -> tuple[Float, Float]:
@@ -167,8 +145,7 @@ def _combine(heard: Tracks, values: Float, variance: str | None, rows: Int, star
     mean = np.full((len(heard.valid), len(start) - 1), np.nan)
     spread = np.full_like(mean, np.nan)
     _combine_scalar(
-        heard.valid, _per_run(heard, values), _per_run(heard, weight),
-        rows, start, mean, spread,
+        heard.valid, values, weight, rows, start, mean, spread,
     )  # fmt: skip
     if given is None:
         spread = np.where(np.isnan(spread), np.nan, 0.0)
@@ -196,9 +173,9 @@ def _combine_position(
     valid: Bool, x: Float, y: Float, ee: Float, en: Float, nn: Float, rows: Int, start: Int,
     out_x: Float, out_y: Float, out_ee: Float, out_en: Float, out_nn: Float,
 ) -> None:  # fmt: skip
-    shared = ee.shape[0] == 1
     for s in range(out_x.shape[0]):
-        i = 0 if shared else s
+        i = s if ee.shape[0] > 1 else 0  # one row where all runs agree
+        j = s if x.shape[0] > 1 else 0
         for p in range(out_x.shape[1]):
             a = b = d = u = v = x0 = y0 = 0.0
             n = 0
@@ -207,9 +184,9 @@ def _combine_position(
                 if not valid[s, r]:
                     continue
                 if n == 0:  # relative to the first: weights of exact states are large
-                    x0, y0 = x[s, r], y[s, r]
+                    x0, y0 = x[j, r], y[j, r]
                 n += 1
-                dx, dy = x[s, r] - x0, y[s, r] - y0
+                dx, dy = x[j, r] - x0, y[j, r] - y0
                 a, b, d = a + ee[i, r], b + en[i, r], d + nn[i, r]
                 u, v = u + ee[i, r] * dx + en[i, r] * dy, v + en[i, r] * dx + nn[i, r] * dy
             if n:
@@ -223,6 +200,8 @@ def _combine_scalar(
     valid: Bool, values: Float, weight: Float, rows: Int, start: Int, mean: Float, spread: Float
 ) -> None:
     for s in range(mean.shape[0]):
+        i = s if values.shape[0] > 1 else 0  # one row where all runs agree
+        j = s if weight.shape[0] > 1 else 0
         for p in range(mean.shape[1]):
             total = first = moment = 0.0
             n = 0
@@ -231,9 +210,9 @@ def _combine_scalar(
                 if not valid[s, r]:
                     continue
                 if n == 0:
-                    first = values[s, r]
+                    first = values[i, r]
                 n += 1
-                total += weight[s, r]
-                moment += weight[s, r] * (values[s, r] - first)
+                total += weight[j, r]
+                moment += weight[j, r] * (values[i, r] - first)
             if n:
                 mean[s, p], spread[s, p] = first + moment / total, 1 / total

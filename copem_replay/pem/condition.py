@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -65,11 +65,16 @@ def _within(value: Float, low: float, high: float) -> Bool:
 
 
 class Couple(Frozen):
-    """(d_c, p_c) under condition c: the paper's element of a PEM. Without `error` the state is exact."""
+    """(d_c, p_c) under condition c: the paper's element of a PEM. Without `error` the state is exact.
+
+    `existence`: how probable the unit claims it to be that there is an object, of each entry alike (0.9 is chosen), or
+    by its visible share: the more of it is seen, the surer the unit.
+    """
 
     when: Condition = Condition()
     detection: Annotated[DetectionModel, Slot("detection", DETECTION_MODELS)]
     error: Annotated[ErrorModel, Slot("error", ERROR_MODELS)] | None = None
+    existence: Share | Literal["visible_share"] = 0.9
 
 
 Pem = Annotated[tuple[Couple, ...], Field(min_length=1)]

@@ -56,6 +56,9 @@ def _covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
     return value
 
 
+Covariance = Annotated[tuple[Pair, Pair], AfterValidator(_covariance)]
+
+
 class Gaussian(ErrorModel):
     """Gaussian errors with full covariance.
 
@@ -65,7 +68,7 @@ class Gaussian(ErrorModel):
     """
 
     kind: Literal["gaussian"] = "gaussian"
-    covariance_m2: Annotated[tuple[Pair, Pair], AfterValidator(_covariance)]
+    covariance_m2: Covariance
     mean_m: Pair = (0.0, 0.0)
     frame: Literal["absolute", "line_of_sight"] = "absolute"
     yaw_sigma_deg: NotNegative = 0.0

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _NEARLY = 0.005
 """The axis ends when each curve has come this near to its last value (chosen)."""
+MOST_BANDS = 6
+"""More bands than this hide each other (chosen)."""
 _INSTANTS = 600
 """At which a band is drawn, at most (chosen: a few per pixel's width)."""
 
@@ -52,13 +54,17 @@ class Curve:
 
 
 def curves_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """Share detected over the time since the onset, with 95 % bands, and the exact curves where there are some."""
+    """Share detected over the time since the onset.
+
+    With 95 % bands, unless there are too many of them, and the exact curves, where there are some.
+    """
     names = results.chosen(configurations)
     over, cluster = clusters(results.table)
     curves = {}
     for name in names:
         rows = results.table["configuration"] == name
-        curves[name] = _curve(results.table[rows], cluster[rows] if over else None, results.experiment.seed)
+        banded = over is not None and len(names) <= MOST_BANDS
+        curves[name] = _curve(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
     exact = {name: _exact(results.exact, name) for name in names} if results.exact is not None else {}
     with style():
         figure = _drawn(results, curves, exact)
@@ -162,6 +168,8 @@ def _note(
     if over is None:
         few = f"fewer than {FEWEST_CLUSTERS}"
         bands = f"No bands: {few} logs and {few} objects, and more runs do not tell about other traffic"
+    elif len(names) > MOST_BANDS:
+        bands = f"No bands with more than {MOST_BANDS} curves; choose some with --configurations"
     end_s = figure.axes[0].get_xlim()[1]
     later = max((curve.last - _share_at(curve, end_s) for curve in curves.values()), default=0.0)
     add_note(

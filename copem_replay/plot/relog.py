@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from copem_replay.check import read_logs
 from copem_replay.errors import RecordingError
-from copem_replay.experiment import Objects
+from copem_replay.measure_keys import Objects
 from copem_replay.plot.folder import Results
 from copem_replay.replay import Replay, prepare
 

@@ -14,7 +14,8 @@ import pandas as pd
 
 from copem_replay.braking.driver import Driver
 from copem_replay.braking.encounter import Encounter
-from copem_replay.experiment import Experiment, InRange, LineOfSight, StartsMoving
+from copem_replay.experiment import Experiment
+from copem_replay.measure_keys import InRange, LineOfSight, StartsMoving
 from copem_replay.plot.course import Course, braked_course, recorded_course
 from copem_replay.replay import Replay
 from copem_replay.tracks import CLASSES

@@ -34,7 +34,7 @@ def share_curves(replay: Replay, experiment: Experiment, object_ix: int) -> dict
     """By whom an object is seen, and how much of it; nobody's curve is left out."""
     scene, tracks = replay.scene, replay.measured.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
-    carriers = np.array([carrier(scene, unit) for unit in experiment.units.values()], dtype=np.int64)
+    carriers = np.array([carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
     share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
     rows = np.flatnonzero(tracks.row_object_ix == object_ix)

@@ -13,10 +13,10 @@ from copem_replay.atomic import atomic_file
 from copem_replay.colours import configuration_colours
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
+from copem_replay.fusion.belief import Belief
 from copem_replay.replay import Replay
 from copem_replay.show import layout, marks, plots, sight, units, words, world
 from copem_replay.show.out import Out, digest, part_of
-from copem_replay.tracks import Tracks
 
 SHOWN_OBJECTS = 6
 """How many measured objects have names, lines of sight, marks and plots of their own (chosen)."""
@@ -26,7 +26,7 @@ def write_rrd(
     path: Path,
     replay: Replay,
     experiment: Experiment,
-    beliefs: Mapping[str, Tracks],
+    beliefs: Mapping[str, Belief],
     table: pd.DataFrame,
     summary: pd.DataFrame,
     run: int,
@@ -66,7 +66,7 @@ def latest_known(table: pd.DataFrame, most: int) -> list[str]:
 
 
 def _fill(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Tracks], table: pd.DataFrame,
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
     summary: pd.DataFrame, run: int, shown: Sequence[int],
 ) -> None:  # fmt: skip
     import rerun as rr
@@ -87,10 +87,10 @@ def _fill(
     for name, colour in colours.items():
         world.believed(out, ["world", part_of(name)], scene, beliefs[name], colour)
         marks.detections(out, replay, experiment, table, name, shown, colour)
-        plots.position_errors(out, replay, experiment, name, beliefs[name], shown, colour)
+        plots.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
         words.events(out, name, table[table["configuration"] == name])
     if len(replay.looks.object_ix):
-        plots.known(out, replay, beliefs, colours)
+        plots.known(out, replay, {name: belief.fused for name, belief in beliefs.items()}, colours)
     words.summary(out, replay, experiment, summary, run)
 
 

@@ -26,13 +26,13 @@ def sight(out: Out, replay: Replay, experiment: Experiment, shown: Sequence[int]
     """From the ego's first unit (the first of all, if it has none) to each shown object, or to what hides it most."""
     import rerun as rr
 
-    if not experiment.units or not shown:
+    if not experiment.modelled or not shown:
         return
     scene, truth = replay.scene, replay.truth
-    carriers = {name: carrier(scene, unit) for name, unit in experiment.units.items()}
+    carriers = {name: carrier(scene, unit) for name, unit in experiment.modelled.items()}
     on_ego = [name for name, on in carriers.items() if on == scene.ego_ix >= 0]
     first = [*on_ego, *carriers][0]
-    unit = experiment.units[first]
+    unit = experiment.modelled[first]
     at = poses(scene, unit, truth, unit_ground(truth, first, unit, []))
     observer, flat = observers([at], np.array([carriers[first]])), experiment.visibility == "flat"
     [share] = visible_shares(truth, replay.found.static, observer, flat=flat)

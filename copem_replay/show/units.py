@@ -24,8 +24,8 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
     """A point and a field of view for each unit; neither while its carrier is absent."""
     import rerun as rr
 
-    many = len(experiment.units) > MANY_UNITS
-    for name, unit in experiment.units.items():
+    many = len(experiment.modelled) > MANY_UNITS
+    for name, unit in experiment.modelled.items():
         at, path = replay.found.poses[name], ["world", "units", name]
         place, there = f32(at.x_m, at.y_m, at.z_m), at.present
         elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
@@ -36,7 +36,7 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
         mark, named = rr.Radius.ui_points(4), not (many and unit.at is not None)
         out.static(path, rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=named))
         height_m = mounting_height(replay.scene, replay.truth, unit)
-        _field(out, name, unit, at, elapsed_ns, experiment.pems[unit.pem], height_m)
+        _field(out, name, unit, at, elapsed_ns, experiment.pems[str(unit.pem)], height_m)
 
 
 def outlines(pem: tuple[Couple, ...]) -> list[np.ndarray]:

@@ -9,8 +9,9 @@ import numpy as np
 import pyarrow as pa
 
 from copem_replay.colours import Rgb
+from copem_replay.fusion.belief import Belief
 from copem_replay.show.out import Out, by_frame, elapsed_ns, f32, object_labels, upright
-from copem_replay.tracks import CLASS_GROUPS, CLASSES, Scene, Tracks
+from copem_replay.tracks import CLASS_GROUPS, CLASSES, Int, Scene, Tracks
 from copem_replay.visibility import Statics
 
 if TYPE_CHECKING:  # a second to import: only where something is written
@@ -46,7 +47,8 @@ def truth(out: Out, scene: Scene, truth: Tracks, shown: Sequence[int]) -> None:
     class_ids = scene.object_class.astype(np.uint16) + np.where(scene.moving, 0, _STANDING).astype(np.uint16)
     if scene.ego_ix >= 0:
         class_ids[scene.ego_ix] = _EGO
-    _boxes(out, ["world", "truth", "boxes"], scene, truth, class_ids)
+    labels = object_labels(scene).take(pa.array(truth.row_object_ix))
+    _boxes(out, ["world", "truth", "boxes"], truth, class_ids[truth.row_object_ix], labels)
     wireframe = rr.components.FillMode.MajorWireframe
     out.static(["world", "truth", "boxes"], rr.Boxes3D.from_fields(fill_mode=wireframe, radii=0.03, show_labels=False))
     rows, counts = by_frame(truth, np.isin(truth.row_object_ix, shown))
@@ -98,29 +100,39 @@ def statics(out: Out, static: Statics) -> None:
     out.static(["world", "static"], mesh)
 
 
-def believed(out: Out, path: list[str], scene: Scene, tracks: Tracks, colour: Rgb) -> None:
+def believed(out: Out, path: list[str], scene: Scene, belief: Belief, colour: Rgb) -> None:
     """Boxes and ellipses of a configuration's lists."""
     import rerun as rr
 
-    _boxes(out, [*path, "boxes"], scene, tracks, scene.object_class.astype(np.uint16))
+    tracks, class_ix = belief.fused, belief.class_of(scene)
+    _boxes(out, [*path, "boxes"], tracks, class_ix.astype(np.uint16), _labels(belief, scene, class_ix))
     solid = rr.components.FillMode.TransparentFillMajorWireframe
     style = rr.Boxes3D.from_fields(colors=[(*colour, 150)], radii=0.04, fill_mode=solid, show_labels=False)
     out.static([*path, "boxes"], style)
     _covariance(out, [*path, "covariance"], tracks, colour)
 
 
-def _boxes(out: Out, path: list[str], scene: Scene, tracks: Tracks, class_ids: np.ndarray) -> None:
-    """All boxes of `tracks`, list by list, from the instant each list is available. `class_ids` (N,)."""
+def _labels(belief: Belief, scene: Scene, class_ix: Int) -> pa.Array:
+    """(P,) what each row is called: its object, or what it is taken for where there is none."""
+    object_ix = belief.fused.row_object_ix
+    if belief.said is None:
+        return object_labels(scene).take(pa.array(object_ix))
+    nobody = pa.array([f"unmatched {name}" for name in CLASSES], pa.string())
+    every = pa.concat_arrays([object_labels(scene), nobody])
+    return every.take(pa.array(np.where(object_ix >= 0, object_ix, len(scene.object_ids) + class_ix)))
+
+
+def _boxes(out: Out, path: list[str], tracks: Tracks, class_ids: np.ndarray, labels: pa.Array) -> None:
+    """All boxes of `tracks`, list by list, from the instant each list is available. `class_ids` and `labels` (P,)."""
     import rerun as rr
 
     rows, counts = by_frame(tracks, tracks.valid[0])
-    object_ix = tracks.row_object_ix[rows]
     columns = rr.Boxes3D.columns(
         centers=f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
         half_sizes=f32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,
         quaternions=upright(tracks.yaw_rad[0, rows]),
-        class_ids=class_ids[object_ix],
-        labels=object_labels(scene).take(pa.array(object_ix)),
+        class_ids=class_ids[rows],
+        labels=labels.take(pa.array(rows)),
     )
     out.columns(path, elapsed_ns(tracks), columns.partition(counts))
 

@@ -1,0 +1,131 @@
+"""Appraise: how good were a configuration's fused lists? Matched with the truth at the instant each was available."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from copem_replay.accuracy import Accuracy, Settings, assess, for_runs
+from copem_replay.believe import Believed
+from copem_replay.detect import Detections, shortest_period_s
+from copem_replay.experiment import Experiment
+from copem_replay.fusion.agree import AGREE
+from copem_replay.match import Matches, match
+from copem_replay.matched import Steps, first_matches
+from copem_replay.measure_keys import Measure
+from copem_replay.onset import Looks, Reference, measured_objects, reference_at
+from copem_replay.resample import at_instants
+from copem_replay.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """One log's truth at the instants of fused lists. What configurations share is computed once."""
+
+    scene: Scene
+    truth: Tracks
+    experiment: Experiment
+    _worlds: dict[bytes, Tracks] = field(default_factory=dict)
+    _references: dict[bytes, Reference] = field(default_factory=dict)
+
+    def at(self, time_s: Float) -> Tracks:
+        """The truth at instants (K,), ascending."""
+        key = time_s.tobytes()
+        if key not in self._worlds:
+            stamps = self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
+            gap_s = self.experiment.max_gap_s
+            self._worlds[key] = at_instants(self.truth, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
+        return self._worlds[key]
+
+    def reference(self, time_s: Float) -> Reference:
+        """From where distances are measured, at instants (K,)."""
+        key = time_s.tobytes()
+        if key not in self._references:
+            self._references[key] = reference_at(self.scene, self.truth, self.experiment, time_s)
+        return self._references[key]
+
+    def classes(self, measure: Measure) -> Bool:
+        """(C,) which classes are measured: only of these are entries that nothing true belongs to ghosts."""
+        measured: Bool = np.zeros(len(CLASSES), dtype=bool)
+        measured[self.scene.object_class[measured_objects(self.scene, measure)]] = True
+        if measure.objects.ids is None and measure.objects.classes is not None:
+            measured[class_indices(measure.objects.classes)] = True
+        # A `vehicle`, not said which, may be a car; what is not classified at all may be anything.
+        alike: Bool = np.array(AGREE[:, measured].any(axis=1))
+        alike[CLASSES.index("other")] = measured[CLASSES.index("other")]
+        return alike
+
+    def since_s(self, looks: Looks) -> Float:
+        """(M,) when each object that is looked at first is in the log."""
+        first = np.full(len(self.scene.object_ids), np.inf)
+        np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
+        since: Float = first[looks.object_ix]
+        return since
+
+
+@dataclass(frozen=True)
+class Appraisal:
+    """Of one configuration in the runs (S,), or in the one that stands for all.
+
+    `issue_s (K,)`: when each list was available. `detections` and `steps`: as matches tell, whatever the fusion.
+    """
+
+    issue_s: Float
+    matches: Matches
+    detections: Detections
+    steps: Steps
+    accuracy: Accuracy | None
+
+
+def match_lists(around: Surroundings, believed: Believed, measure: Measure) -> Matches:
+    """Which true object each entry of the fused lists is about."""
+    return match(believed.lists, around.at(believed.at.issue_s), around.scene, gate_m=measure.match.gate_m)
+
+
+def appraise(around: Surroundings, looks: Looks, believed: Believed, measure: Measure, runs: int) -> Appraisal:
+    """Match a configuration's lists in so many runs with the truth, and measure them."""
+    issue_s, newest = believed.at.issue_s, believed.at.newest
+    matches = match_lists(around, believed, measure)
+    captured_s = np.where(newest >= 0, believed.heard.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
+    detections, steps = first_matches(
+        believed.lists, matches, issue_s, looks,
+        confirm=measure.confirm, count_earlier=measure.count_earlier, list_captured_s=captured_s,
+        period_s=shortest_period_s(believed.heard),
+    )  # fmt: skip
+    accuracy = None
+    if measure.accuracy:
+        captures: Float = np.unique(believed.heard.captured_s)
+        assessed = assess(
+            believed.lists, matches, issue_s, around.at(issue_s), around.at(captures), around.scene, looks,
+            around.since_s(looks), around.reference(issue_s),
+            around.classes(measure), settings=settings_of(measure, around.scene.end_s),
+        )  # fmt: skip
+        accuracy = for_runs(assessed, runs)
+    return Appraisal(issue_s, matches, detections, steps, accuracy)
+
+
+DISTANCE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
+"""Of bands of distance (chosen)."""
+
+TIME_BANDS = 120
+"""At most so many bands of time, of whole seconds (chosen)."""
+
+EXISTENCE_THRESHOLDS = (
+    0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.89, 0.91, 0.95,
+    0.98, 0.992, 0.9992, 0.99992, 0.999992,
+)  # fmt: skip
+"""At which ghosts are counted (chosen: the last ones tell two, three, … units of existence 0.9 from fewer)."""
+
+
+def settings_of(measure: Measure, end_s: float) -> Settings:
+    """Parameters of the accuracy for a log that ends at `end_s`."""
+    cutoff_m = measure.gospa.cutoff_m if measure.gospa.cutoff_m is not None else measure.match.gate_m
+    step_s = max(1, int(np.ceil(end_s / TIME_BANDS)))
+    return Settings(
+        cutoff_m,
+        measure.gospa.power,
+        DISTANCE_EDGES_M,
+        tuple(float(edge) for edge in range(0, int(end_s) + 1 + step_s, step_s)),
+        EXISTENCE_THRESHOLDS,
+    )

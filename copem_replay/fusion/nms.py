@@ -1,0 +1,111 @@
+"""Non-maximum suppression: of entries that overlap the most certain one is kept, and nothing is averaged."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numba as nb
+import numpy as np
+
+from copem_replay.components import Positive, Share
+from copem_replay.fusion.agree import AGREE
+from copem_replay.fusion.cluster_kernel import WIDTH, sort_rows
+from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.gnn import numbers
+from copem_replay.fusion.object_list import Entries, Lists, Reports
+from copem_replay.fusion.overlap import rotated_iou
+from copem_replay.fusion.union import run_after_run, side_by_side
+from copem_replay.tracks import Bool, Float, Int
+
+
+class Nms(ListFusion):
+    """Greedy non-maximum suppression over every unit's newest list, the usual late fusion of cooperative detection.
+
+    Entries claimed less likely than `min_existence` are left out. Of the others the most likely come first (of equals
+    the smaller trace of covariance, then the newer capture, then x and y), and each is kept unless its class agrees
+    with that of one kept already and the two overlap: their boxes by more than `iou` (intersection over union), or,
+    `by: centre`, their centres are within `radius_m`. What is kept is one unit's word, unchanged. Source: R. Xu et
+    al., "OPV2V", ICRA 2022, whose settings the thresholds of existence and overlap are; the radius is chosen. Assumes
+    that the most confident unit is the most accurate one and that boxes of one object overlap. Position errors of the
+    order of the box (pedestrians; stale lists; entries without a size) leave duplicates, objects closer than the
+    threshold suppress each other, and where all units claim certainty the smallest stated covariance decides.
+    """
+
+    kind: Literal["nms"] = "nms"
+    by: Literal["iou", "centre"] = "iou"
+    iou: Share = 0.15
+    radius_m: Positive = 2.0
+    min_existence: Share = 0.2
+
+    def fuse(self, reports: Reports) -> Lists:
+        """Every run by itself."""
+        runs = []
+        for run in reports.lists.start:
+            bounds = run - run[0]
+            entries = reports.lists.entries[run[0] : run[-1]]
+            start, rows = side_by_side(bounds, reports.newest, entries["existence"] >= self.min_existence)
+            kind = np.argmax(entries["class_probability"], axis=1)
+            # Closer than the sum of both reaches boxes may overlap, and centres do.
+            reach_m = np.full(len(entries), self.radius_m / 2)
+            if self.by == "iou":
+                reach_m = np.hypot(entries["length_m"], entries["width_m"]) / 2
+            place = np.stack([entries["x_m"], entries["y_m"], reach_m])
+            start, kept = _keep(
+                entries, place, kind, _order(entries, bounds, reports), start, rows, AGREE, self.by == "iou", self.iou
+            )
+            runs.append((start, entries[kept]))
+        fused = run_after_run(runs, len(reports.issue_s))
+        fused.entries["track_id"] = -1
+        return fused
+
+
+def _order(entries: Entries, bounds: Int, reports: Reports) -> Int:
+    """(N,) in which entries are considered: by what they say, and of the very same the first to arrive."""
+    f = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+    keys = np.column_stack(
+        [
+            -entries["existence"], entries["cov_ee_m2"] + entries["cov_nn_m2"], -reports.captured_s[f],
+            numbers(entries)[:, :WIDTH], reports.arrives_s[f], reports.unit_ix[f],
+        ]
+    )  # fmt: skip
+    order = np.arange(len(entries))
+    sort_rows(keys, order)
+    return order
+
+
+@nb.njit(cache=True, nogil=True)
+def _keep(
+    entries: Entries, place: Float, kind: Int, order: Int, start: Int, rows: Int, agree: Bool, by_iou: bool, iou: float
+) -> tuple[Int, Int]:
+    """Which of the `rows`, those of instant k between `start[k]` and `start[k + 1]`, are kept, and where each begin.
+
+    `place (3, N)`: x, y and reach.
+    """
+    kept, kept_start = np.empty_like(rows), np.zeros_like(start)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    n = 0
+    for k in range(len(start) - 1):
+        for r in order[np.sort(rank[rows[start[k] : start[k + 1]]])]:
+            free = True
+            for q in range(kept_start[k], n):
+                s = kept[q]
+                dx, dy, reach = place[0, r] - place[0, s], place[1, r] - place[1, s], place[2, r] + place[2, s]
+                if dx * dx + dy * dy > reach * reach or not agree[kind[r], kind[s]]:
+                    continue
+                if not by_iou or _iou(entries[r], entries[s]) > iou:
+                    free = False
+                    break
+            if free:
+                kept[n] = r
+                n += 1
+        kept_start[k + 1] = n
+    return kept_start, kept[:n].copy()
+
+
+@nb.njit(cache=True, nogil=True)
+def _iou(a: Any, b: Any) -> float:
+    share: float = rotated_iou(
+        a.x_m, a.y_m, a.yaw_rad, a.length_m, a.width_m, b.x_m, b.y_m, b.yaw_rad, b.length_m, b.width_m
+    )
+    return share

@@ -1,0 +1,88 @@
+"""The tracker: a Kalman filter per object over everything that arrives, with three answers to lists that come late."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from copem_replay.components import NotNegative, Positive, Share
+from copem_replay.fusion.agree import AGREE
+from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.object_list import ENTRY, Lists, Reports
+from copem_replay.fusion.track_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run, rows_in_order
+from copem_replay.fusion.union import run_after_run
+from copem_replay.resample import wrap
+from copem_replay.tracks import Float
+
+_CONTENT = ENTRY.fields["captured_s"][1] // 8 if ENTRY.fields else 0
+"""So many numbers of an entry say what it is; when and whose it is stands behind them."""
+_LATE = {"stale": STALE, "predict": PREDICT, "replay": REPLAY}
+
+
+class Tracker(ListFusion):
+    """Keeps a constant-velocity Kalman filter per object, fed by every list that arrives, the late ones too.
+
+    List after list, entries are assigned to tracks at least total cost d² + ln|S|, S = P + R, where d² is within `gate`
+    (the share of true pairs inside: χ², two degrees of freedom) and the classes agree; whoever is left founds a track
+    of the entry's own velocity ± `speed_sigma_mps` per axis. Velocities are not measured after that. `late` says what
+    becomes of a list that shows the past: `stale`, it is taken for the present; `predict`, its entries are moved to now
+    by their own velocities, R growing by q·age³/3; `replay`, it is heard at its capture, and everything captured since
+    again: the same as if it had been in time, up to `buffer_s` back, beyond which it is ignored. What a unit last
+    claimed of a track fades with `forget_s`, existence is 1 − Π(1 − cₙe^(−age/forget)), so that it depends on time and
+    not on the rate of lists; where it is not above `drop` a track ends. It is published above `publish`, when the
+    captures that support it span `confirm_s`. Of two tracks as close as two entries of one object may be (d² within the
+    median of χ²), which no list held both for `forget_s`, the younger ends. Yaw and height above ground are the newest
+    entry's, size and class probabilities the mean of all.
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001.
+    Assumes white acceleration of density q = `acceleration_psd_m2ps3`, Gaussian position errors of the stated
+    covariance, independent between lists and units, without bias. A turning or braking object lags behind, its track
+    too sure of itself; a biased unit, or one whose errors persist, splits objects or pulls them along; an object not
+    listed beside its neighbour can be taken for it as long as it is within the gate.
+    """
+
+    kind: Literal["tracker"] = "tracker"
+    late: Literal["stale", "predict", "replay"] = "predict"
+    # All numbers are chosen.
+    acceleration_psd_m2ps3: Positive = 1.0
+    speed_sigma_mps: Positive = 3.0
+    gate: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.999
+    forget_s: Positive = 1.0
+    publish: Share = 0.5
+    drop: Share = 0.05
+    confirm_s: NotNegative = 0.1
+    buffer_s: Positive = 2.0
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        if self.drop > self.publish:
+            raise ValueError(f"drop: expected at most publish ({self.publish}), found {self.drop}")
+        return self
+
+    def fuse(self, reports: Reports) -> Lists:
+        """Every run by itself, instant after instant."""
+        rules = Rules(
+            _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
+            self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
+        )  # fmt: skip
+        runs = [
+            fuse_run(
+                _said(reports, s), rules, len(reports.units), reports.issue_s, reports.arrived, reports.arrived_start
+            )
+            for s in range(len(reports.lists.start))
+        ]
+        fused = run_after_run(runs, len(reports.issue_s))
+        fused.entries["yaw_rad"] = wrap(fused.entries["yaw_rad"])
+        return fused
+
+
+def _said(reports: Reports, run: int) -> Said:
+    """What the units say in one run."""
+    lists = reports.lists
+    entries = np.ascontiguousarray(lists.entries[lists.start[run, 0] : lists.start[run, -1]])
+    start = lists.start[run] - lists.start[run, 0]
+    numbers = entries.view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
+    content: Float = numbers[:, :_CONTENT]
+    return Said(start, rows_in_order(start, content), entries, content, reports.captured_s, reports.unit_ix)

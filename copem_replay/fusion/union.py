@@ -1,0 +1,70 @@
+"""The union of all lists: what fusion has to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numba as nb
+import numpy as np
+
+from copem_replay.components import Share
+from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.tracks import Bool, Int
+
+
+class Union(ListFusion):
+    """All entries of every unit's newest list side by side, as they are; those claimed less likely than
+    `min_existence` are left out. No source: it is what cooperative perception is before any fusion. It assumes
+    nothing, and so an object listed by n units is there n times, n − 1 times as a duplicate, and every ghost stays.
+    """
+
+    kind: Literal["union"] = "union"
+    min_existence: Share = 0.0
+
+    def fuse(self, reports: Reports) -> Lists:
+        """Every run by itself."""
+        runs = []
+        for bounds in reports.lists.start:
+            entries = reports.lists.entries[bounds[0] : bounds[-1]]
+            start, rows = side_by_side(bounds - bounds[0], reports.newest, entries["existence"] >= self.min_existence)
+            runs.append((start, entries[rows]))
+        fused = run_after_run(runs, len(reports.issue_s))
+        # Two units' numbers of tracks have nothing to do with each other.
+        fused.entries["track_id"] = -1
+        return fused
+
+
+def run_after_run(runs: Sequence[tuple[Int, Entries]], instants: int) -> Lists:
+    """Lists of all runs from each run's, `start (K + 1,)` beginning at 0, and entries."""
+    start = np.zeros((len(runs), instants + 1), dtype=np.int64)
+    total = 0
+    for s, (one, _) in enumerate(runs):
+        start[s] = total + one
+        total += int(one[-1])
+    return Lists(start, np.concatenate([entries_of(0), *(entries for _, entries in runs)]))
+
+
+@nb.njit(cache=True, nogil=True)
+def side_by_side(bounds: Int, newest: Int, counts: Bool) -> tuple[Int, Int]:
+    """Rows of the entries that count of all newest lists at each instant, (R,), and where each instant's begin.
+
+    `bounds (F + 1,)` of the lists, `newest (K, U)`, `counts (N,)`; `start (K + 1,)`.
+    """
+    start = np.zeros(len(newest) + 1, np.int64)
+    for k in range(len(newest)):
+        start[k + 1] = start[k]
+        for f in newest[k]:
+            if f >= 0:
+                start[k + 1] += np.sum(counts[bounds[f] : bounds[f + 1]])
+    rows = np.empty(start[-1], np.int64)
+    n = 0
+    for k in range(len(newest)):
+        for f in newest[k]:
+            if f >= 0:
+                for r in range(bounds[f], bounds[f + 1]):
+                    if counts[r]:
+                        rows[n] = r
+                        n += 1
+    return start, rows

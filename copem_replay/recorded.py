@@ -1,0 +1,138 @@
+"""Recorded units: lists as they were recorded in the log, beside those of modelled units.
+
+A list is captured at its `last_measurement_time`, else `delay_s` before its stamp, and arrives at its stamp. What the
+messages don't say of the covariance and of the existence comes from the experiment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from copem_replay.assignment import assign
+from copem_replay.errors import RecordingError
+from copem_replay.experiment import Recorded
+from copem_replay.fusion.agree import AGREE
+from copem_replay.lists import RecordedLists, read_recorded
+from copem_replay.resample import at_instants
+from copem_replay.tracks import SAME_INSTANT_NS, Float, Int, Scene, Tracks, joined
+from copem_replay.wording import counted
+
+MOVING_MPS = 2.0
+"""A track moves that is faster than this, and its unit says so (chosen: jitter of a place is not)."""
+MOSTLY = 0.8
+"""More than this share of entries is no chance (chosen)."""
+
+
+@dataclass(frozen=True)
+class RecordedUnits:
+    """The lists of all recorded units of an experiment over one log, one run; every row is a track of its own. (P,)
+
+    Of `tracks`, `object_ix` is the truth id of the gated optimal assignment at its capture, −1: none.
+    """
+
+    tracks: Tracks
+    existence: Float
+    class_probability: Float  # (P, C)
+    track_id: Int
+
+
+def recorded_unit(path: Path, scene: Scene, name: str, asked: Recorded) -> tuple[RecordedLists, list[str]]:
+    """A unit's lists with all that is asked for, and what has to be said of them.
+
+    Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
+    """
+    found = read_recorded(path, asked.topic, scene)
+    tracks = found.tracks
+    if not len(tracks.stamp_ns):
+        raise RecordingError(f"{path}: {asked.topic}: holds no list")
+    unsaid = ~found.spread_said
+    if unsaid.any() and asked.covariance_m2 is None:
+        raise RecordingError(
+            f"{path}: {asked.topic}: {unsaid.sum()} of {counted(len(unsaid), 'entry', 'entries')} say nothing of their "
+            "covariance (base_rmse.position); give `covariance_m2`"
+        )
+    notes = [f"unit {name}: {found.dropped} of its entries have no position and are left out"] if found.dropped else []
+    columns: dict[str, Any] = {}
+    if asked.covariance_m2 is not None:
+        (ee, en), (_, nn) = asked.covariance_m2
+        for column, value in (("cov_ee_m2", ee), ("cov_en_m2", en), ("cov_nn_m2", nn)):
+            columns[column] = np.where(unsaid, value, getattr(tracks, column))
+    late_ns = np.where(found.capture_said, 0, round(asked.delay_s * 1e9))
+    arrives_ns = scene.t0_ns + np.rint(tracks.arrives_s[0] * 1e9).astype(np.int64)
+    stamp_ns = np.minimum(tracks.stamp_ns - late_ns, arrives_ns)
+    early = int((tracks.stamp_ns > arrives_ns + SAME_INSTANT_NS).sum())
+    if early:
+        said = counted(early, "list says it was", "lists say they were")
+        notes.append(f"unit {name}: {said} captured after arriving; taken as captured then")
+    tracks = replace(
+        tracks, units=(name,), stamp_ns=stamp_ns, captured_s=(stamp_ns - scene.t0_ns) * np.float64(1e-9), **columns
+    )
+    backwards = _backwards(found)
+    if backwards is not None and backwards > MOSTLY:
+        notes.append(
+            f"unit {name}: its velocities point against the way its own tracks move ({backwards:.0%} of its entries); "
+            "what goes by them (`tracker` with `late: predict`, new tracks) is led astray"
+        )
+    existence = np.where(np.isnan(found.existence), asked.existence, found.existence)
+    return replace(found, tracks=tracks, existence=np.clip(existence, 0.0, 1.0)), notes
+
+
+def _backwards(found: RecordedLists) -> float | None:
+    """Of the entries of moving tracks the share whose velocity points against their way; None: nothing moves."""
+    tracks = found.tracks
+    order = np.lexsort((tracks.row_captured_s, found.track_id))
+    same = (np.diff(found.track_id[order]) == 0) & (np.diff(tracks.row_captured_s[order]) > 0)
+    before, after = order[:-1][same], order[1:][same]
+    step_s = tracks.row_captured_s[after] - tracks.row_captured_s[before]
+    east, north = ((getattr(tracks, n)[0, after] - getattr(tracks, n)[0, before]) / step_s for n in ("x_m", "y_m"))
+    vx, vy = tracks.vx_mps[0, after], tracks.vy_mps[0, after]
+    moving = (np.hypot(east, north) > MOVING_MPS) & (np.hypot(vx, vy) > MOVING_MPS)
+    if not moving.any():
+        return None
+    return float(((east * vx + north * vy) < 0)[moving].mean())
+
+
+def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float) -> Tracks:
+    """The unit's tracks with truth ids: list by list the optimal assignment by distance, classes agreeing, gated."""
+    tracks = found.tracks
+    stamps, back = np.unique(tracks.stamp_ns, return_inverse=True)
+    world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
+    order, bounds = world.by_frame
+    mine, starts = tracks.by_frame
+    object_ix = np.full(len(tracks.frame_ix), -1)
+    likely = found.class_probability.argmax(axis=1)
+    for f in range(len(tracks.stamp_ns)):
+        rows = mine[starts[f] : starts[f + 1]]
+        there = order[bounds[back[f]] : bounds[back[f] + 1]]
+        if not len(rows) or not len(there):
+            continue
+        away_m = np.hypot(
+            tracks.x_m[0, rows, None] - world.x_m[0, there], tracks.y_m[0, rows, None] - world.y_m[0, there]
+        )
+        allowed = AGREE[likely[rows][:, None], scene.object_class[world.row_object_ix[there]]]
+        allowed &= away_m <= gate_m + 1e-9
+        partner = np.full(len(rows), -1)
+        # As many pairs as there can be, and of those the nearest: a pair is worth more than all distances.
+        assign(np.where(allowed, away_m - (len(rows) + 1) * (gate_m + 1.0), np.inf), partner)
+        object_ix[rows[partner >= 0]] = world.row_object_ix[there[partner[partner >= 0]]]
+    return replace(tracks, object_ix=object_ix)
+
+
+def recorded_units(
+    lists: Mapping[str, RecordedLists], scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float
+) -> RecordedUnits | None:
+    """All recorded units of an experiment as one; None where there are none."""
+    if not lists:
+        return None
+    pieces = [with_truth_ids(found, scene, truth, gate_m=gate_m, max_gap_s=max_gap_s) for found in lists.values()]
+    return RecordedUnits(
+        joined(tuple(lists), pieces),
+        np.concatenate([found.existence for found in lists.values()]),
+        np.concatenate([found.class_probability for found in lists.values()]),
+        np.concatenate([found.track_id for found in lists.values()]),
+    )

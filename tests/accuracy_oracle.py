@@ -1,0 +1,291 @@
+"""What the sums of accuracy mean, list by list and object by object in plain Python; and truths built by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from copem_replay.accuracy import BAND, EXISTENCE, OBJECT, RUN, Accuracy, Settings
+from copem_replay.fusion.object_list import Lists
+from copem_replay.match import DUPLICATE, GHOST, MATCH, Matches
+from copem_replay.onset import Looks, Reference
+from copem_replay.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
+
+Array = npt.NDArray[Any]
+SAME_S = 1e-6
+Places = Mapping[int, Sequence[tuple[float, float] | None]]
+"""Where each object is at each instant; None: not in the truth."""
+
+
+def truth_of(
+    places: Places, times_s: Sequence[float], velocity: Mapping[int, tuple[float, float]] | None = None
+) -> Tracks:
+    """The truth at instants, its tracks in the order given; `velocity` by object, else all stand."""
+    there = {o: [k for k, place in enumerate(row) if place is not None] for o, row in places.items()}
+    objects = [o for o in places if there[o]]
+    rows = [(o, k) for o in objects for k in there[o]]
+    values = {name: np.zeros((1, len(rows))) for name in VALUES}
+    for p, (o, k) in enumerate(rows):
+        place = places[o][k]
+        assert place is not None
+        values["x_m"][0, p], values["y_m"][0, p] = place
+        values["vx_mps"][0, p], values["vy_mps"][0, p] = (velocity or {}).get(o, (0.0, 0.0))
+    times = np.array(times_s, dtype=float)
+    return Tracks(
+        units=(TRUTH,),
+        start=np.cumsum([0, *(len(there[o]) for o in objects)]),
+        unit_ix=np.zeros(len(objects), dtype=int),
+        object_ix=np.array(objects, dtype=int),
+        frame_ix=np.array([k for _, k in rows], dtype=int),
+        stamp_ns=np.rint(times * 1e9).astype(np.int64),
+        captured_s=times,
+        frame_unit_ix=np.zeros(len(times), dtype=int),
+        arrives_s=times[None],
+        valid=np.ones((1, len(rows)), dtype=bool),
+        **values,
+    )
+
+
+def scene_of(*classes: str) -> Scene:
+    """Objects of these classes; the first is the ego."""
+    return Scene(
+        log="log",
+        t0_ns=0,
+        end_ns=10**12,
+        object_ids=tuple(map(str, range(len(classes)))),
+        object_class=np.array([CLASSES.index(name) for name in classes], dtype=np.int8),
+        moving=np.ones(len(classes), dtype=bool),
+        ego_ix=0,
+    )
+
+
+def looks_of(looks: Mapping[int, tuple[float, float]]) -> Looks:
+    """Onset and end by object."""
+    onset, end = (np.array([look[q] for look in looks.values()], dtype=float) for q in (0, 1))
+    nothing = np.zeros(len(onset), dtype=int)
+    return Looks(np.array(list(looks), dtype=int), onset, nothing > 0, end, nothing)
+
+
+def reference_of(places: Sequence[tuple[float, float] | None]) -> Reference:
+    """A point to measure from, at each list; None: absent."""
+    x, y = (np.array([np.nan if place is None else place[q] for place in places], dtype=float) for q in (0, 1))
+    return Reference(x, y, *(np.zeros(len(places)) for _ in range(3)), np.array([p is not None for p in places], bool))
+
+
+def likely(entry: Any) -> int:
+    """Its most probable class."""
+    return list(entry["class_probability"]).index(max(entry["class_probability"]))
+
+
+def band_of(edges: Sequence[float], value: float) -> int | None:
+    for d in range(len(edges) - 1):
+        if edges[d] <= value < edges[d + 1]:
+            return d
+    return None
+
+
+def best_pairs(truth: Array, believed: Array, cutoff_m: float, power: float) -> dict[int, tuple[int, float]]:
+    """Of each truth that has one the partner and the distance."""
+    away = np.array([[np.hypot(*(t - b)) for b in believed] for t in truth]).reshape(len(truth), len(believed))
+    cost = np.minimum(away, cutoff_m) ** power
+    return {
+        int(i): (int(j), float(away[i, j]))
+        for i, j in zip(*linear_sum_assignment(cost), strict=True)
+        if away[i, j] < cutoff_m
+    }
+
+
+def nearest_of(here: list[tuple[int, Array]], place: Array) -> int | None:
+    return min(range(len(here)), key=lambda h: np.hypot(*(here[h][1] - place)), default=None)
+
+
+def nees_of(entry: Any, error: Array) -> float:
+    covariance = np.array([[entry["cov_ee_m2"], entry["cov_en_m2"]], [entry["cov_en_m2"], entry["cov_nn_m2"]]])
+    size, direction = np.linalg.eigh(covariance)
+    return float(sum((error @ direction[:, q]) ** 2 / max(size[q], 1e-9) for q in (0, 1)))
+
+
+def plainly(
+    lists: Lists, matches: Matches, issue_s: Array, places: Places, velocity: Mapping[int, tuple[float, float]],
+    captures_s: Sequence[float], places_captured: Places, looks: Looks, stay_from_s: Array,
+    reference: Reference, measured: Array, settings: Settings,
+) -> Accuracy:  # fmt: skip
+    """The same as `assess`, by the sentences of its module."""
+    S, K, M = len(lists.start), len(issue_s), len(looks.object_ix)
+    edges = {"by_distance": settings.distance_edges_m, "by_time": settings.time_edges_s}
+    window = [
+        [k for k in range(K) if stay_from_s[m] - SAME_S <= issue_s[k] <= looks.ended_s[m] + SAME_S] for m in range(M)
+    ]
+    column = {(m, k): c for c, (m, k) in enumerate((m, k) for m in range(M) for k in window[m])}
+    by_object, by_run = np.zeros((S, M), OBJECT), np.zeros(S, RUN)
+    banded = {name: np.zeros((S, max(len(given) - 1, 0)), BAND) for name, given in edges.items()}
+    by_existence = np.zeros((S, 10), EXISTENCE)
+    ghosts_at = np.zeros((S, len(settings.existence_thresholds)), dtype=int)
+    error_m, gospa = (np.full((S, len(column)), np.nan, dtype=np.float32) for _ in range(2))
+
+    present = [k for k in range(K) if reference.present[k]]
+    spacings = [issue_s[k + 1] - issue_s[k] for k in present if k + 1 in present]
+    by_run["lists"] = len(present)
+    by_run["time_s"] = len(present) * float(np.mean(spacings)) if spacings else 0.0
+
+    def at(o: int, k: int) -> Array | None:
+        place = places[o][k] if o in places else None
+        return None if place is None else np.array(place)
+
+    def away(k: int, place: Array) -> float:
+        return float(np.hypot(place[0] - reference.x_m[k], place[1] - reference.y_m[k]))
+
+    def bands(s: int, k: int, place: Array) -> list[Any]:
+        found = {
+            "by_distance": band_of(edges["by_distance"], away(k, place)),
+            "by_time": band_of(edges["by_time"], float(issue_s[k])),
+        }
+        return [banded[name][s, d : d + 1] for name, d in found.items() if d is not None]
+
+    for s in range(S):
+        for m, o in enumerate(looks.object_ix):
+            stay = [k for k in window[m] if k in present and at(o, k) is not None]
+            known: list[tuple[float, bool]] = []
+            tracks: list[int] = []
+            for k in stay:
+                place = at(o, k)
+                assert place is not None
+                mine: list[Any] = []
+                for i in range(lists.start[s, k], lists.start[s, k + 1]):
+                    if matches.object_ix[i] == o and matches.role[i] == MATCH:
+                        mine.append(lists.entries[i])
+                    if matches.object_ix[i] == o and matches.role[i] == DUPLICATE:
+                        by_object[s, m]["duplicates"] += issue_s[k] >= looks.onset_s[m] - SAME_S
+                assert len(mine) <= 1
+                known.append((float(issue_s[k]), bool(mine)))
+                sums = [by_object[s, m : m + 1], *bands(s, k, place)]
+                if issue_s[k] >= looks.onset_s[m] - SAME_S:
+                    for one in sums:
+                        one["looked"] += 1
+                        one["missed"] += not mine
+                if not mine:
+                    continue
+                (entry,) = mine
+                error = np.array([entry["x_m"], entry["y_m"]]) - place
+                error_m[s, column[m, k]] = np.hypot(*error)
+                for one in sums:
+                    one["pairs"] += 1
+                    one["square_m2"] += error @ error
+                    one["east_m"] += error[0]
+                    one["north_m"] += error[1]
+                    one["nees"] += nees_of(entry, error)
+                speed = np.array([entry["vx_mps"], entry["vy_mps"]]) - np.array(velocity.get(o, (0.0, 0.0)))
+                by_object[s, m]["velocity_square_m2ps2"] += speed @ speed
+                by_object[s, m]["age_s"] += issue_s[k] - entry["captured_s"]
+                nearest = min(
+                    range(len(captures_s)), key=lambda f: abs(captures_s[f] - entry["captured_s"]), default=-1
+                )
+                if nearest >= 0 and abs(captures_s[nearest] - entry["captured_s"]) <= SAME_S:
+                    then = places_captured[o][nearest] if o in places_captured else None
+                    if then is not None:
+                        by_object[s, m]["pairs_captured"] += 1
+                        by_object[s, m]["square_captured_m2"] += (entry["x_m"] - then[0]) ** 2
+                        by_object[s, m]["square_captured_m2"] += (entry["y_m"] - then[1]) ** 2
+                if entry["track_id"] >= 0:
+                    tracks.append(int(entry["track_id"]))
+            by_object[s, m]["tracked"] = len(tracks)
+            by_object[s, m]["switches"] = sum(a != b for a, b in pairwise(tracks))
+            by_object[s, m]["mtl_s"] = longest_unknown(known, looks.onset_s[m], looks.ended_s[m])
+        for k in present:
+            here = [
+                (m, place)
+                for m, o in enumerate(looks.object_ix)
+                if (place := at(o, k)) is not None
+                and k in window[m]
+                and looks.onset_s[m] - SAME_S <= issue_s[k] <= looks.ended_s[m] + SAME_S
+            ]
+            believed = []
+            for i in range(lists.start[s, k], lists.start[s, k + 1]):
+                entry, role, o = lists.entries[i], matches.role[i], matches.object_ix[i]
+                place = np.array([entry["x_m"], entry["y_m"]])
+                by_run[s]["duplicates"] += role == DUPLICATE and o in looks.object_ix
+                is_measured = bool(measured[likely(entry)])
+                if is_measured:
+                    claim = by_existence[s, min(int(entry["existence"] * 10), 9)]
+                    claim["entries"] += 1
+                    claim["existence"] += entry["existence"]
+                    claim["with_object"] += role != GHOST
+                if role == GHOST and is_measured:
+                    by_run[s]["ghosts"] += 1
+                    ghosts_at[s] += entry["existence"] >= np.array(settings.existence_thresholds)
+                    for one in bands(s, k, place):
+                        one["ghosts"] += 1
+                    h = nearest_of(here, place)
+                    if h is not None:
+                        by_object[s, here[h][0]]["ghosts"] += 1
+                    believed.append(place)
+                elif role != GHOST and o in [looks.object_ix[m] for m, _ in here]:
+                    believed.append(place)
+            if not here:
+                continue
+            by_run[s]["lists_looked"] += 1
+            unit = settings.cutoff_m**settings.power
+            pairs = best_pairs(
+                np.array([place for _, place in here]), np.array(believed), settings.cutoff_m, settings.power
+            )
+            parts = {h: [0.0, 0.0, 0.0] for h in range(len(here))}
+            for h in parts:
+                if h in pairs:
+                    parts[h][0] = pairs[h][1] ** settings.power
+                else:
+                    parts[h][1] = unit / 2
+            for b in set(range(len(believed))) - {b for b, _ in pairs.values()}:
+                h = nearest_of(here, believed[b])
+                assert h is not None
+                parts[h][2] += unit / 2
+            for h, (m, _) in enumerate(here):
+                for q, name in enumerate(("localisation", "missed", "false")):
+                    by_object[s, m][f"gospa_{name}"] += parts[h][q]
+                gospa[s, column[m, k]] = sum(parts[h])
+            most = max(len(here), len(believed))
+            total = sum(d**settings.power for _, d in pairs.values()) + unit * (most - len(pairs))
+            by_run[s]["ospa_m"] += (total / most) ** (1 / settings.power)
+    return Accuracy(
+        settings=settings,
+        first_list=np.array([int((issue_s < stay_from_s[m] - SAME_S).sum()) for m in range(M)], dtype=int),
+        count=np.array([len(w) for w in window], dtype=int),
+        error_m=error_m,
+        gospa=gospa,
+        by_object=by_object,
+        by_run=by_run,
+        ghosts_at=ghosts_at,
+        by_existence=by_existence,
+        **banded,
+    )
+
+
+def longest_unknown(known: list[tuple[float, bool]], onset_s: float, ended_s: float) -> float:
+    """The longest stretch of [onset, end] in which the last list said so far held no match."""
+    changes = sorted({onset_s, ended_s, *(min(max(t, onset_s), ended_s) for t, _ in known)})
+    longest = stretch = 0.0
+    for begin, end in pairwise(changes):
+        said = [is_known for t, is_known in known if t <= begin + SAME_S]
+        stretch = 0.0 if said and said[-1] else stretch + end - begin
+        longest = max(longest, stretch)
+    return longest
+
+
+def permuted(lists: Lists, matches: Matches | None, rng: np.random.Generator) -> tuple[Lists, Matches | None, Array]:
+    """The same lists, each in another order, and where each entry came from."""
+    to = np.arange(len(lists.entries))
+    for start in lists.start:
+        for a, b in pairwise(start):
+            to[a:b] = a + rng.permutation(b - a)
+    moved = None if matches is None else Matches(matches.object_ix[to], matches.role[to])
+    return Lists(lists.start, lists.entries[to]), moved, to
+
+
+def one_run(lists: Lists, run: int) -> tuple[Lists, slice]:
+    """The lists of one run by itself, and which entries they are."""
+    first, last = int(lists.start[run, 0]), int(lists.start[run, -1])
+    return Lists(lists.start[run : run + 1] - first, lists.entries[first:last]), slice(first, last)
