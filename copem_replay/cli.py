@@ -129,6 +129,38 @@ def run(
 
 
 @app.command()
+def compare(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Results folders.")],
+    configurations: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
+    ] = None,
+    baseline: Annotated[
+        str | None, typer.Option(metavar="C", help="What they are compared with [the one named ideal].")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write all of it as .csv, or the table as .md.")
+    ] = None,
+    ghosts_per_min: Annotated[
+        float | None, typer.Option(metavar="X", min=0, help="Ghosts at which times are compared [the baseline's].")
+    ] = None,
+) -> int:
+    """Configurations with a baseline, paired on log, object and run, within or across results folders."""
+    from copem_replay.compare import check_out, comparison_text, write_comparison
+    from copem_replay.compare import compare as compared
+
+    if out is not None:
+        check_out(out)
+    names = None if configurations is None else [name.strip() for name in configurations.split(",")]
+    comparison = compared(folders, configurations=names, baseline=baseline, ghosts_per_min=ghosts_per_min)
+    _complain(f"note: {note}" for note in comparison.notes)
+    _print_blocks([comparison_text(comparison).splitlines()])
+    if out is not None:
+        write_comparison(comparison, out)
+        print(_printable(f"written to {out}"))
+    return 0
+
+
+@app.command()
 def plot(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder.")],
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Where the figures go [DIR/figures].")] = None,

@@ -1,0 +1,85 @@
+"""Intervals of differences: which clusters are resampled whole, and with which draws.
+
+The clusters are those of `summary.csv`, drawn by the same dice: logs, if there are at least five; else measured
+objects, if there are at least five; runs, where there is one object in one log. With fewer there is no interval: more
+runs do not tell about other traffic, and few of anything do not tell how it varies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.chance import Address, Dice, object_words
+from copem_replay.compare.grid import Grid
+from copem_replay.paired import multiplicities
+from copem_replay.summary import FEWEST_CLUSTERS, RESAMPLES
+from copem_replay.tracks import Bool, Int
+
+Counts = NDArray[np.uint32]
+_KEPT = 4
+"""Sets of clusters whose draws are kept (chosen: few differ, and each may be large)."""
+
+
+@dataclass(frozen=True)
+class Whose:
+    """What items (i,) are of: a log, an object (−1: of none in particular), a run (−1: of all)."""
+
+    log_ix: Int
+    object_ix: Int
+    run: Int
+
+    def take(self, kept: Bool) -> Whose:
+        """Some of them."""
+        return Whose(self.log_ix[kept], self.object_ix[kept], self.run[kept])
+
+
+class Draws:
+    """Resamples of clusters, addressed by their names: the same clusters are drawn alike for every metric."""
+
+    def __init__(self, seed: int) -> None:
+        self._dice = Dice(seed, "summary")
+        self._kept: dict[tuple[str, ...], Counts] = {}
+
+    def counts(self, names: tuple[str, ...]) -> Counts:
+        """(R, K) how often each cluster is drawn."""
+        if names not in self._kept:
+            zeros = np.zeros(len(names), dtype=np.int64)
+            address = Address(("",), zeros, object_words(names), zeros)
+            drawn = multiplicities(self._dice.uniform("bootstrap", address, np.arange(RESAMPLES)))
+            while len(self._kept) >= _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[names] = drawn
+        return self._kept[names]
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """`names` of K clusters, sorted, and which one each item is of (i,), −1: of none, it always counts once."""
+
+    over: str
+    names: tuple[str, ...]
+    of: Int
+
+
+def clusters(whose: Whose, grid: Grid) -> Clusters | None:
+    """What is resampled; None: too little of anything."""
+    things, logs = np.unique(whose.object_ix[whose.object_ix >= 0]), np.unique(whose.log_ix)
+    if len(things) == 1 and len(logs) == 1:
+        found = _named("runs", whose.run, [str(run) for run in range(grid.runs)])
+    elif len(logs) >= FEWEST_CLUSTERS:
+        found = _named("logs", whose.log_ix, grid.logs)
+    else:
+        found = _named("objects", whose.object_ix, grid.objects)
+    return found if len(found.names) >= FEWEST_CLUSTERS else None
+
+
+def _named(over: str, of: Int, names: Sequence[str]) -> Clusters:
+    """Clusters in the order of their names, as `summary.csv` has them."""
+    there = sorted({int(k) for k in np.unique(of[of >= 0])}, key=lambda k: names[k])
+    number = np.full(len(names) + 1, -1, dtype=np.int64)
+    number[there] = np.arange(len(there))
+    return Clusters(over, tuple(names[k] for k in there), number[of])

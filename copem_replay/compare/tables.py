@@ -1,0 +1,104 @@
+"""A comparison as text: for a terminal, as Markdown, as CSV. Nothing is cut off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from copem_replay.atomic import atomic_file
+from copem_replay.compare.comparison import Comparison
+from copem_replay.compare.regret import METRICS
+from copem_replay.errors import OutputError
+from copem_replay.table import as_text
+
+_SUFFIXES = (".csv", ".md")
+_NOTHING = 1e-9
+"""Closer to 0 than this is 0 (chosen: below what any of the metrics is measured with)."""
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """A row per configuration, a column per metric, and what they are; for a terminal or a pipe."""
+    return "\n".join([as_text(_cells(comparison)), *_lines(comparison)])
+
+
+def comparison_markdown(comparison: Comparison) -> str:
+    """The same as a Markdown table, the lines after it as a list; ends with a newline."""
+    cells = _cells(comparison)
+    rows = [list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)]
+    lines = ["| " + " | ".join(_escaped(str(cell)) for cell in row) + " |" for row in rows]
+    return "\n".join([*lines, "", *(f"- {_escaped(line)}" for line in _lines(comparison)), ""])
+
+
+def check_out(path: Path) -> None:
+    """Raise OutputError where a comparison cannot be written as what the file's name says."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {path.name}")
+
+
+def write_comparison(comparison: Comparison, path: Path) -> None:
+    """Write CSV (a row per log, configuration and metric) or a Markdown table, as the name says. Raises OutputError."""
+    from copem_replay.results import write_csv
+
+    check_out(path)
+    with atomic_file(path) as scratch:
+        if path.suffix.lower() == ".csv":
+            write_csv(comparison.table, scratch)
+        else:
+            scratch.write_text(comparison_markdown(comparison), encoding="utf-8")
+
+
+def _cells(comparison: Comparison) -> pd.DataFrame:
+    rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
+    metrics = [metric for metric in METRICS if any((name, metric) in rows for name in comparison.configurations)]
+    columns: dict[str, list[str]] = {"configuration": list(comparison.configurations)}
+    for metric in metrics:
+        columns[metric] = [_cell(rows.get((name, metric))) for name in comparison.configurations]
+    return pd.DataFrame(columns)
+
+
+def _cell(row: Any) -> str:
+    """`+0.12 [0.05, 0.2]`; a dash where there is no difference."""
+    if row is None or pd.isna(row.difference):
+        return "–"
+    if pd.isna(row.interval_over):
+        return _signed(row.difference)
+    low, high = ("–" if pd.isna(limit) else _plain(limit) for limit in (row.low, row.high))
+    return f"{_signed(row.difference)} [{low}, {high}]"
+
+
+def _signed(value: float) -> str:
+    return "±0" if abs(value) < _NOTHING else ("+" if value > 0 else "") + _plain(value)
+
+
+def _plain(value: float) -> str:
+    return "0" if abs(value) < _NOTHING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _lines(comparison: Comparison) -> Iterator[str]:
+    """What the table shows, and who is better than the baseline."""
+    overall = comparison.overall
+    shown = set(overall["metric"])
+    yield f"differences to {comparison.baseline}, paired by log, object and run; accuracy at instants that both have"
+    over = overall.dropna(subset="interval_over").groupby("interval_over", sort=False)["metric"].unique()
+    kinds = [kind if len(over) == 1 else f"{kind} ({', '.join(metrics)})" for kind, metrics in over.items()]
+    if kinds:
+        yield f"[95 %]: bootstrap interval over {'; '.join(kinds)}"
+    yield f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that"
+    if "ttd_rmst_s_equal_ghosts" in shown:
+        yield (
+            "ttd_rmst_s_equal_ghosts: the same, of each with entries below an existence left out, the lowest with at "
+            f"most {comparison.ghosts_per_min:.4g} ghosts per minute"
+        )
+    for metric, better in METRICS.items():
+        of = overall[overall["metric"] == metric]
+        beyond = of["low"] > _NOTHING if better > 0 else of["high"] < -_NOTHING
+        if beyond.any():
+            names = ", ".join(of.loc[beyond, "configuration"])
+            yield f"better than {comparison.baseline} in {metric}, the interval excluding 0: {names}"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("|", "\\|")

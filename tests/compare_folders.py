@@ -1,0 +1,160 @@
+"""Results folders written by hand: a few rows of every table, so that differences can be computed in the head."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from pyarrow import parquet
+
+Row = dict[str, Any]
+
+INSTANTS = [0.0, 1.0, 2.0, 3.0]
+"""Of the fused lists of every configuration, unless told otherwise."""
+
+_DETECTIONS = {
+    "log": pa.string(),
+    "configuration": pa.string(),
+    "run": pa.int64(),
+    "object_id": pa.string(),
+    "onset_s": pa.float64(),
+    "detected": pa.bool_(),
+    "detection_s": pa.float64(),
+    "distance_at_detection_m": pa.float64(),
+    "ended_s": pa.float64(),
+    "ended_by": pa.string(),
+}
+_VERDICTS = {"conflict": pa.bool_(), "braking_pass": pa.bool_()}
+_ACCURACY = {
+    "log": pa.string(),
+    "configuration": pa.string(),
+    "run": pa.int64(),
+    "object_id": pa.string(),
+    "first_list": pa.int64(),
+    "error_m": pa.list_(pa.float32()),
+    "gospa_m2": pa.list_(pa.float32()),
+    "ghosts": pa.int64(),
+}
+_LISTS = {
+    "log": pa.string(),
+    "configuration": pa.string(),
+    "run": pa.int64(),
+    "lists": pa.int64(),
+    "minutes": pa.float64(),
+    "ghosts": pa.int64(),
+    "duplicates": pa.int64(),
+    "existence": pa.list_(pa.float64()),
+    "ghosts_at": pa.list_(pa.int64()),
+}
+_INSTANTS = {"log": pa.string(), "configuration": pa.string(), "available_s": pa.list_(pa.float64())}
+_THRESHOLDS = {
+    "log": pa.string(),
+    "configuration": pa.string(),
+    "run": pa.int64(),
+    "object_id": pa.string(),
+    "existence": pa.float64(),
+    "detection_s": pa.float64(),
+}
+
+MEASURE = {
+    "objects": {"classes": None, "ids": None},
+    "onset": {"kind": "in_range", "range_m": 50.0},
+    "count_earlier": False,
+    "confirm": {"hits": 1, "of": 1},
+    "match": {"gate_m": 3.0, "always": False},
+    "distance_to": "ego",
+    "horizon_s": None,
+    "conflict": None,
+    "exact": False,
+    "accuracy": True,
+    "gospa": {"cutoff_m": None, "power": 2.0},
+    "horizon_used_s": 10.0,
+}
+BRAKING = {"driver": {"kind": "constant_deceleration", "a_max_mps2": 8.0}, "margin_m": 0.5, "brakes_for": "object"}
+
+
+def row(configuration: str, detection_s: float | None, distance_m: float | None = None, **more: Any) -> Row:
+    """Object 7 of log `a` in run 0: from 0 s on, for 10 s, then it left. `more`: other columns, of any table."""
+    given = {
+        "log": "a",
+        "configuration": configuration,
+        "run": 0,
+        "object_id": "7",
+        "onset_s": 0.0,
+        "detected": detection_s is not None,
+        "detection_s": detection_s,
+        "distance_at_detection_m": distance_m,
+        "ended_s": 10.0,
+        "ended_by": "object_left",
+    }
+    return given | more
+
+
+def seen(configuration: str, error_m: Sequence[float | None], gospa_m2: Sequence[float | None], **more: Any) -> Row:
+    """The same row with what its lists say of the object: of all instants from `first_list` on."""
+    accuracy = {"first_list": 0, "error_m": list(error_m), "gospa_m2": list(gospa_m2), "ghosts": 0}
+    return row(configuration, 0.0, 20.0) | accuracy | more
+
+
+def ghosts(configuration: str, count: int, **more: Any) -> Row:
+    """Lists of log `a` in run 0, over a minute, `count` ghosts in them."""
+    given = {"log": "a", "configuration": configuration, "run": 0, "lists": 4, "minutes": 1.0, "ghosts": count}
+    return given | {"duplicates": 0, "existence": [0.0], "ghosts_at": [count]} | more
+
+
+def step(configuration: str, existence: float, detection_s: float, **more: Any) -> Row:
+    """Object 7 of log `a` in run 0 is detected at `detection_s` with thresholds up to `existence`."""
+    given = {"log": "a", "configuration": configuration, "run": 0, "object_id": "7"}
+    return given | {"existence": existence, "detection_s": detection_s} | more
+
+
+def write_folder(
+    path: Path,
+    rows: Sequence[Row],
+    *,
+    lists: Sequence[Row] = (),
+    steps: Sequence[Row] | None = None,
+    available_s: dict[str, Sequence[float]] | None = None,
+    logs: dict[str, str] | None = None,
+    ego: str | None = None,
+    measure: dict[str, Any] | None = None,
+    **provenance: Any,
+) -> Path:
+    """A results folder. `logs`: names and contents; `available_s`: by configuration, where not INSTANTS."""
+    path.mkdir(parents=True)
+    names = list(dict.fromkeys(r["log"] for r in rows))
+    logs = logs or {name: f"content of {name}" for name in names}
+    said = {
+        "seed": 1,
+        "runs": max(r["run"] for r in rows) + 1,
+        "logs": [{"log": name, "topic": "ground_truth", "sha256": content} for name, content in logs.items()],
+        "visibility": "surface",
+        "max_gap_s": 0.5,
+        "measure": MEASURE | (measure or {}),
+        "braking": None,
+    }
+    said |= provenance
+    (path / "provenance.json").write_text(json.dumps(said))
+    (path / "experiment.yaml").write_text(f"version: 1\nego: {'null' if ego is None else ego}\n")
+    _write(path / "detections.parquet", rows, _DETECTIONS | (_VERDICTS if said["braking"] else {}))
+    if any("error_m" in r for r in rows):
+        _write(path / "accuracy.parquet", rows, _ACCURACY)
+        of = [(log, name) for log in names for name in dict.fromkeys(r["configuration"] for r in rows)]
+        instants = [
+            {"log": log, "configuration": name, "available_s": list((available_s or {}).get(name, INSTANTS))}
+            for log, name in of
+        ]
+        _write(path / "instants.parquet", instants, _INSTANTS)
+    if lists:
+        _write(path / "lists.parquet", lists, _LISTS)
+    if steps is not None:
+        _write(path / "thresholds.parquet", steps, _THRESHOLDS)
+    return path
+
+
+def _write(path: Path, rows: Sequence[Row], columns: dict[str, pa.DataType]) -> None:
+    table = {name: pa.array([r.get(name) for r in rows], kind) for name, kind in columns.items()}
+    parquet.write_table(pa.table(table), path)

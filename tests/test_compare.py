@@ -1,0 +1,259 @@
+"""Comparisons of detections: differences computed in the head, intervals by a plain loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from compare_folders import BRAKING, Row, row, write_folder
+from copem_replay.chance import Address, Dice, object_words
+from copem_replay.compare import Comparison, compare
+
+
+def compared(path: Path, rows: Sequence[Row], **given: Any) -> Comparison:
+    return compare([write_folder(path / "study", rows, **given)])
+
+
+def of(comparison: Comparison, metric: str, log: str = "all") -> Any:
+    """The one row of a metric."""
+    table = comparison.table
+    found = table[(table["metric"] == metric) & (table["log"] == log)]
+    assert len(found) == 1
+    return found.iloc[0]
+
+
+THREE = [
+    row("ideal", 1.0, 30.0),
+    row("ideal", 2.0, 20.0, object_id="8"),
+    row("ideal", None, object_id="9"),
+    row("late", 1.5, 25.0),
+    row("late", None, object_id="8"),
+    row("late", None, object_id="9"),
+]
+"""One object seen half a second later, one no more, one by nobody."""
+
+
+def test_the_share_detected_loses_the_one_that_is_not_seen(tmp_path):
+    share = of(compared(tmp_path, THREE), "detected_share")
+    assert (share["value"], share["baseline_value"]) == pytest.approx((1 / 3, 2 / 3))
+    assert share["difference"] == pytest.approx(-1 / 3)
+    assert share["n"] == 3
+    assert (share["only_configuration"], share["only_baseline"]) == (0, 1)
+    assert share["p_value"] == 1.0
+
+
+def test_never_detected_counts_as_the_horizon(tmp_path):
+    time = of(compared(tmp_path, THREE), "ttd_rmst_s")
+    assert time["value"] == pytest.approx((1.5 + 10 + 10) / 3)
+    assert time["baseline_value"] == pytest.approx((1 + 2 + 10) / 3)
+    assert time["difference"] == pytest.approx((0.5 + 8 + 0) / 3)
+
+
+def test_the_horizon_that_was_given_cuts_all_times(tmp_path):
+    comparison = compared(tmp_path, THREE, measure={"horizon_s": 1.25})
+    assert comparison.horizon_s == 1.25
+    # 1.5 and never are 1.25 now, and so is the baseline's 2.
+    assert of(comparison, "ttd_rmst_s")["difference"] == pytest.approx((0.25 + 0 + 0) / 3)
+
+
+def test_who_was_still_there_counts_as_long_as_he_was_looked_at(tmp_path):
+    still = {"ended_by": "log_end", "ended_s": 4.0}
+    comparison = compared(tmp_path, [row("ideal", 1.0, 30.0, **still), row("late", None, **still)])
+    time = of(comparison, "ttd_rmst_s")
+    assert (time["value"], time["baseline_value"], time["difference"]) == (4.0, 1.0, 3.0)
+    away = compared(tmp_path / "away", [row("ideal", 1.0, 30.0, ended_s=4.0), row("late", None, ended_s=4.0)])
+    assert of(away, "ttd_rmst_s")["difference"] == 9.0
+
+
+def test_times_count_from_the_onset(tmp_path):
+    rows = [row("ideal", 5.0, 30.0, onset_s=5.0), row("late", 5.5, 30.0, onset_s=5.0)]
+    time = of(compared(tmp_path, rows), "ttd_rmst_s")
+    assert (time["value"], time["baseline_value"]) == (0.5, 0.0)
+
+
+def test_the_median_is_of_the_differences_with_never_below_every_distance(tmp_path):
+    # −5 m, −∞ and 0, where both have nothing: the one in the middle.
+    distance = of(compared(tmp_path, THREE), "dad_median_m")
+    assert distance["difference"] == -5.0
+    assert distance["n"] == 3
+    assert pd.isna(distance["value"])  # 25 m, never, never
+    assert distance["baseline_value"] == 20.0
+
+
+def test_an_infinite_median_is_none(tmp_path):
+    lost = of(compared(tmp_path, [*THREE[:2], *THREE[3:5]]), "dad_median_m")
+    assert pd.isna(lost["difference"])
+    assert lost["n"] == 2
+
+
+def test_detected_where_the_truth_has_a_gap_has_no_distance_to_compare(tmp_path):
+    rows = [*THREE, row("ideal", 1.0, 30.0, object_id="10"), row("late", 1.0, None, object_id="10")]
+    comparison = compared(tmp_path, rows)
+    assert of(comparison, "dad_median_m")["n"] == 3
+    assert of(comparison, "ttd_rmst_s")["n"] == 4
+
+
+def test_pass_share_is_of_those_in_conflict(tmp_path):
+    verdicts = [
+        (True, True, False),
+        (True, True, False),
+        (True, False, False),
+        (True, False, True),
+        (False, True, True),
+    ]
+    rows = [
+        row(name, 1.0, 30.0, object_id=str(k), conflict=conflict, braking_pass=passes if conflict else None)
+        for k, (conflict, *of_sides) in enumerate(verdicts)
+        for name, passes in zip(("ideal", "late"), of_sides, strict=True)
+    ]
+    share = of(compared(tmp_path, rows, braking=BRAKING), "pass_share")
+    assert (share["value"], share["baseline_value"], share["difference"]) == (0.25, 0.5, -0.25)
+    assert share["n"] == 4
+    assert (share["only_configuration"], share["only_baseline"]) == (1, 2)
+    assert share["p_value"] == pytest.approx(binomtest(1, 3).pvalue)
+    assert pd.isna(share["interval_over"])  # four objects are too few
+
+
+def test_without_braking_there_is_no_pass_share(tmp_path):
+    assert "pass_share" not in set(compared(tmp_path, THREE).table["metric"])
+
+
+# ----------------------------------------------------------------------------------------------- intervals
+
+SEED = 5
+
+
+def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]], seed: int = SEED) -> tuple[float, float]:
+    """2000 times: as many clusters as there are, drawn by the dice; the mean of all differences in them."""
+    names = sorted(clusters)
+    zeros = np.zeros(len(names), dtype=np.int64)
+    uniform = Dice(seed, "summary").uniform(
+        "bootstrap", Address(("",), zeros, object_words(names), zeros), np.arange(2000)
+    )
+    means = []
+    for resample in uniform:
+        pairs = [pair for u in resample for pair in clusters[names[int(u * len(names))]]]
+        means.append(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def pairs_of(times: Sequence[tuple[float, float]], **where: Any) -> list[Row]:
+    """Run after run, detected by `late` and by `ideal`."""
+    return [
+        row(name, time, 30.0 - time, run=run, **where)
+        for run, both in enumerate(times)
+        for name, time in zip(("late", "ideal"), both, strict=True)
+    ]
+
+
+def test_objects_are_resampled_whole(tmp_path):
+    rng = np.random.default_rng(7)
+    of_objects = {str(k): [(float(a) + k, float(b)) for a, b in rng.uniform(0, 2, (3, 2))] for k in range(6)}
+    rows = [r for name, times in of_objects.items() for r in pairs_of(times, object_id=name)]
+    time = of(compared(tmp_path, rows, seed=SEED), "ttd_rmst_s")
+    expected = limits_by_a_loop({f"a\n{name}": times for name, times in of_objects.items()})
+    assert time["interval_over"] == "objects"
+    assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_five_logs_are_resampled_whole_and_each_by_what_it_has(tmp_path):
+    rng = np.random.default_rng(8)
+    of_logs = {f"log{k}": [(float(a) + k, float(b)) for a, b in rng.uniform(0, 2, (6, 2))] for k in range(5)}
+    rows = [r for name, times in of_logs.items() for r in pairs_of(times, log=name)]
+    comparison = compared(tmp_path, rows, seed=SEED)
+    time = of(comparison, "ttd_rmst_s")
+    assert time["interval_over"] == "logs"
+    assert (time["low"], time["high"]) == pytest.approx(limits_by_a_loop(of_logs), abs=1e-8)
+    one = of(comparison, "ttd_rmst_s", "log3")
+    times = of_logs["log3"]
+    assert one["interval_over"] == "runs"
+    assert one["difference"] == pytest.approx(np.mean([a - b for a, b in times]), abs=1e-8)
+    expected = limits_by_a_loop({str(run): [both] for run, both in enumerate(times)})
+    assert (one["low"], one["high"]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_the_median_is_resampled_too(tmp_path):
+    # Of six objects three are 1 m and three 2 m nearer: the limits are these, and no mean of any.
+    rows = [r for k in range(6) for r in pairs_of([(1.0 + k % 2, 0.0)], object_id=str(k))]
+    distance = of(compared(tmp_path, rows), "dad_median_m")
+    assert (distance["difference"], distance["low"], distance["high"]) == (-2.0, -2.0, -1.0)
+
+
+def test_few_objects_have_no_interval_and_that_is_said(tmp_path):
+    comparison = compared(tmp_path, [r for k in range(4) for r in pairs_of([(1.0, 0.0)] * 50, object_id=str(k))])
+    assert comparison.table["low"].isna().all()
+    assert comparison.table["interval_over"].isna().all()
+    assert any("no interval of detected_share, ttd_rmst_s, dad_median_m" in note for note in comparison.notes)
+
+
+def test_a_single_run_of_a_single_object_has_no_interval(tmp_path):
+    assert pd.isna(of(compared(tmp_path, pairs_of([(1.0, 0.0)])), "ttd_rmst_s")["interval_over"])
+
+
+# --------------------------------------------------------------------------------------------------- always
+
+RANDOM = np.random.default_rng(11)
+
+
+def random_rows(names: Sequence[str], logs: int = 2) -> list[Row]:
+    rows = []
+    for log in range(logs):
+        for name in names:
+            for k in range(4):
+                for run in range(3):
+                    time = None if RANDOM.random() < 0.3 else float(RANDOM.uniform(0, 10))
+                    verdict = {"conflict": k < 3, "braking_pass": bool(RANDOM.random() < 0.5)}
+                    where = {"log": f"log{log}", "object_id": str(k), "run": run}
+                    rows.append(row(name, time, None if time is None else 50 - time, **where, **verdict))
+    return rows
+
+
+def test_a_difference_of_means_is_the_difference_of_the_values(tmp_path):
+    table = compared(tmp_path, random_rows(["ideal", "b", "c"]), braking=BRAKING).table
+    means = table[table["metric"].isin(["detected_share", "ttd_rmst_s", "pass_share"])]
+    assert set(means["log"]) == {"all", "log0", "log1"}
+    assert len(means) == 3 * 2 * 3
+    assert (means["value"] - means["baseline_value"]).tolist() == means["difference"].tolist()
+
+
+def test_means_of_all_logs_are_those_of_the_logs_by_their_rows(tmp_path):
+    table = compared(tmp_path, random_rows(["ideal", "b"], logs=3)).table
+    times = table[table["metric"] == "ttd_rmst_s"].set_index("log")
+    weighted = times["difference"] * times["n"]
+    assert weighted.drop("all").sum() == pytest.approx(weighted["all"])
+
+
+def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
+    rows = [r | {"configuration": "x"} for r in random_rows(["x"])]
+    folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
+    table = compare(folders, baseline="first:x").table
+    assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
+    assert (table[["difference", "low", "high"]].fillna(0.0) == 0.0).all(axis=None)
+    assert table["difference"].notna().all()
+    assert table.loc[table["log"] == "all", "low"].notna().all()
+
+
+def test_the_order_of_rows_does_not_matter(tmp_path):
+    rows = random_rows(["ideal", "b"])
+    straight = compared(tmp_path, rows, braking=BRAKING).table
+    others = [rows[k] for k in np.random.default_rng(1).permutation(len(rows))]
+    logs = {"log0": "content of log0", "log1": "content of log1"}
+    shuffled = compared(tmp_path / "shuffled", others, braking=BRAKING, logs=logs).table
+    numbers = ["value", "baseline_value", "difference", "low", "high"]
+    assert shuffled[numbers].to_numpy() == pytest.approx(straight[numbers].to_numpy(), nan_ok=True)
+    assert shuffled["metric"].tolist() == straight["metric"].tolist()
+
+
+def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
+    table = compared(tmp_path, random_rows(["ideal", "z", "b"])).table
+    assert table["log"].drop_duplicates().tolist() == ["all", "log0", "log1"]
+    assert table["configuration"].drop_duplicates().tolist() == ["z", "b"]
+    assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "dad_median_m"] * 6
+    assert (table["baseline"] == "ideal").all()

@@ -1,0 +1,303 @@
+"""Comparisons of what the fused lists hold: errors, GOSPA, ghosts, and times at equal ghosts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from compare_folders import Row, ghosts, row, seen, step, write_folder
+from copem_replay.chance import Address, Dice, object_words
+from copem_replay.compare import Comparison, compare
+from copem_replay.compare import lists as lists_module
+
+FOUR = [None] * 4
+
+
+def compared(path: Path, rows: Sequence[Row], *, ghosts_per_min: float | None = None, **given: Any) -> Comparison:
+    return compare([write_folder(path / "study", rows, **given)], ghosts_per_min=ghosts_per_min)
+
+
+def of(comparison: Comparison, metric: str) -> Any:
+    table = comparison.table
+    found = table[(table["metric"] == metric) & (table["log"] == "all")]
+    assert len(found) == 1
+    return found.iloc[0]
+
+
+def resamples(names: Sequence[str], seed: int = 1) -> list[list[str]]:
+    """The clusters of each of 2000 resamples."""
+    ranked = sorted(names)
+    zeros = np.zeros(len(ranked), dtype=np.int64)
+    address = Address(("",), zeros, object_words(ranked), zeros)
+    uniform = Dice(seed, "summary").uniform("bootstrap", address, np.arange(2000))
+    return [[ranked[int(u * len(ranked))] for u in resample] for resample in uniform]
+
+
+# ------------------------------------------------------------------------------------------------- errors
+
+
+def test_errors_are_compared_where_both_match(tmp_path):
+    rows = [seen("ideal", [0, 1, None, 2], FOUR), seen("late", [3, None, 1, 4], FOUR)]
+    error = of(compared(tmp_path, rows), "position_rmse_m")
+    assert error["n"] == 2
+    assert error["value"] == pytest.approx(math.sqrt((9 + 16) / 2))
+    assert error["baseline_value"] == pytest.approx(math.sqrt(4 / 2))
+    assert error["difference"] == pytest.approx(math.sqrt(12.5) - math.sqrt(2))
+
+
+def test_lists_are_paired_by_instant_whatever_their_number(tmp_path):
+    # Of the late lists the first two are at 1 s and 2 s, to half a microsecond; the third is at an instant of its own.
+    instants = {"late": [1.0000005, 2.0, 2.5]}
+    rows = [seen("ideal", [9, 1, 2, 9], FOUR), seen("late", [3, 4, 100], FOUR[:3])]
+    error = of(compared(tmp_path, rows, available_s=instants), "position_rmse_m")
+    assert error["n"] == 2
+    assert error["value"] == pytest.approx(math.sqrt((9 + 16) / 2))
+    assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
+
+
+def test_lists_begin_where_the_objects_stay_does(tmp_path):
+    rows = [seen("ideal", [1, 2], FOUR[:2], first_list=1), seen("late", [3, 5, 7], FOUR[:3])]
+    error = of(compared(tmp_path, rows), "position_rmse_m")  # the instants 1 s and 2 s
+    assert error["value"] == pytest.approx(math.sqrt((25 + 49) / 2))
+    assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
+    back = compare([tmp_path / "study"], baseline="late")
+    assert of(back, "position_rmse_m")["difference"] == pytest.approx(-error["difference"])
+
+
+def test_without_a_common_instant_there_is_nothing_to_compare(tmp_path):
+    rows = [seen("ideal", [1, 1, 1, 1], [1, 1, 1, 1]), seen("late", [1, 1], [1, 1])]
+    comparison = compared(tmp_path, rows, available_s={"late": [1.000003, 1.5]})
+    for metric in ("position_rmse_m", "gospa_m"):
+        assert of(comparison, metric)["n"] == 0
+        assert pd.isna(of(comparison, metric)["difference"])
+
+
+def test_errors_of_objects_are_resampled_whole(tmp_path):
+    rng = np.random.default_rng(3)
+    errors = {str(k): rng.uniform(0, 2 + k, (2, 4)).astype(np.float32) for k in range(5)}
+    rows = [
+        seen(name, [float(e) for e in errors[key][side]], FOUR, object_id=key)
+        for key in errors
+        for side, name in enumerate(("late", "ideal"))
+    ]
+    error = of(compared(tmp_path, rows), "position_rmse_m")
+    means = []
+    for drawn in resamples([f"a\n{key}" for key in errors]):
+        both = np.concatenate([errors[key[2:]] for key in drawn], axis=1).astype(float)
+        first, second = np.sqrt((both**2).mean(axis=1))
+        means.append(first - second)
+    assert error["interval_over"] == "objects"
+    assert (error["low"], error["high"]) == pytest.approx(tuple(np.quantile(means, [0.025, 0.975])), abs=1e-8)
+
+
+# -------------------------------------------------------------------------------------------------- GOSPA
+
+
+def two_objects() -> list[Row]:
+    return [
+        seen("ideal", FOUR, [1, 1, 1, 1]),
+        seen("ideal", FOUR, [None, None, 3, 3], object_id="8"),
+        seen("late", FOUR, [4, 4, 4, 4]),
+        seen("late", FOUR, [None, None, 0, 0], object_id="8"),
+    ]
+
+
+def test_gospa_is_the_root_of_the_mean_over_lists_of_the_sum_over_objects(tmp_path):
+    gospa = of(compared(tmp_path, two_objects()), "gospa_m")
+    assert gospa["n"] == 4
+    assert gospa["value"] == pytest.approx(math.sqrt(16 / 4))
+    assert gospa["baseline_value"] == pytest.approx(math.sqrt(10 / 4))
+    assert gospa["difference"] == pytest.approx(2 - math.sqrt(2.5))
+
+
+def test_gospa_has_the_power_of_the_experiment(tmp_path):
+    of_power = {"gospa": {"cutoff_m": 2.0, "power": 1.0}}
+    assert of(compared(tmp_path, two_objects(), measure=of_power), "gospa_m")["difference"] == 4.0 - 2.5
+
+
+def test_lists_in_which_nobody_is_measured_do_not_count(tmp_path):
+    rows = [seen(name, FOUR, [None, None, part, part]) for name, part in (("ideal", 1), ("late", 9))]
+    gospa = of(compared(tmp_path, rows), "gospa_m")
+    assert (gospa["value"], gospa["baseline_value"], gospa["n"]) == (3.0, 1.0, 2)
+
+
+def test_an_object_that_no_list_is_measured_by_is_none_to_resample(tmp_path):
+    rows = [
+        seen(name, FOUR, [1.0 if k < 4 else None] * 4, object_id=str(k)) for k in range(5) for name in ("ideal", "late")
+    ]
+    comparison = compared(tmp_path, rows)
+    assert of(comparison, "ttd_rmst_s")["interval_over"] == "objects"
+    assert pd.isna(of(comparison, "gospa_m")["interval_over"])
+
+
+def test_each_run_has_its_lists(tmp_path):
+    rows = [
+        seen(name, FOUR[:2], [part + run] * 2, run=run) for name, part in (("ideal", 1), ("late", 4)) for run in (0, 1)
+    ]
+    gospa = of(compared(tmp_path, rows), "gospa_m")
+    assert gospa["n"] == 4
+    assert gospa["difference"] == pytest.approx(math.sqrt(4.5) - math.sqrt(1.5))
+
+
+def test_resampled_objects_leave_the_number_of_lists_as_it_is(tmp_path):
+    parts = {str(k): (float(k), 1.0) for k in range(5)}
+    rows = [
+        seen(name, FOUR, [parts[key][side]] * 4, object_id=key)
+        for key in parts
+        for side, name in enumerate(("late", "ideal"))
+    ]
+    gospa = of(compared(tmp_path, rows), "gospa_m")
+    # Every list has all objects: its sum is that of those drawn.
+    drawn = [[parts[key[2:]] for key in names] for names in resamples([f"a\n{key}" for key in parts])]
+    figures = [math.sqrt(sum(a for a, _ in some)) - math.sqrt(sum(b for _, b in some)) for some in drawn]
+    assert gospa["difference"] == pytest.approx(math.sqrt(10) - math.sqrt(5))
+    assert (gospa["low"], gospa["high"]) == pytest.approx(tuple(np.quantile(figures, [0.025, 0.975])), abs=1e-8)
+
+
+def test_lists_are_paired_part_by_part_as_well_as_at_once(tmp_path, monkeypatch):
+    rng = np.random.default_rng(4)
+    rows = [
+        seen(
+            name, [float(e) if e > 0.5 else None for e in rng.uniform(0, 3, 4)], [1.0, 2.0, 3.0, 4.0], object_id=str(k)
+        )
+        for k in range(7)
+        for name in ("ideal", "late")
+    ]
+    whole = compared(tmp_path, rows).table
+    monkeypatch.setattr(lists_module, "_VALUES", 5)
+    assert compare([tmp_path / "study"]).table.equals(whole)
+
+
+# ------------------------------------------------------------------------------------------------- ghosts
+
+
+def test_ghosts_per_minute_are_of_all_minutes(tmp_path):
+    rows = [row(name, 1.0, 30.0, run=run) for name in ("ideal", "late") for run in (0, 1)]
+    half = {"minutes": 0.5}
+    lists = [
+        ghosts("ideal", 1, **half), ghosts("ideal", 1, run=1, **half),
+        ghosts("late", 3, **half), ghosts("late", 5, run=1, **half),
+    ]  # fmt: skip
+    rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
+    assert (rate["value"], rate["baseline_value"], rate["difference"], rate["n"]) == (8.0, 2.0, 6.0, 2)
+    assert pd.isna(rate["interval_over"])
+
+
+def test_ghosts_go_with_the_object_that_is_nearest_and_the_others_stay(tmp_path):
+    nearest = {str(k): k for k in range(5)}  # ten of them; three more are near nobody
+    rows = [
+        seen(name, FOUR, FOUR, object_id=key, ghosts=near if name == "late" else 0)
+        for key, near in nearest.items()
+        for name in ("ideal", "late")
+    ]
+    rate = of(compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)]), "ghosts_per_min")
+    figures = [3 + sum(nearest[key[2:]] for key in drawn) for drawn in resamples([f"a\n{key}" for key in nearest])]
+    assert rate["difference"] == 13.0
+    assert rate["interval_over"] == "objects"
+    assert (rate["low"], rate["high"]) == pytest.approx(tuple(np.quantile(figures, [0.025, 0.975])))
+
+
+def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(tmp_path):
+    rows = [row(name, 1.0, 30.0, object_id=str(k)) for name in ("ideal", "late") for k in range(5)]
+    comparison = compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)])
+    assert of(comparison, "ttd_rmst_s")["interval_over"] == "objects"
+    assert pd.isna(of(comparison, "ghosts_per_min")["interval_over"])
+
+
+def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
+    counts = [0, 2, 4, 6, 8]
+    rows = [row(name, 1.0, 30.0, run=run) for name in ("ideal", "late") for run in range(5)]
+    lists = [ghosts("late", n, run=run) for run, n in enumerate(counts)]
+    lists += [ghosts("ideal", 1, run=run) for run in range(5)]
+    rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
+    figures = [np.mean([counts[int(run)] for run in drawn]) - 1 for drawn in resamples([str(k) for k in range(5)])]
+    assert (rate["difference"], rate["interval_over"]) == (3.0, "runs")
+    assert (rate["low"], rate["high"]) == pytest.approx(tuple(np.quantile(figures, [0.025, 0.975])))
+
+
+# -------------------------------------------------------------------------------------- at equal ghosts
+
+LISTS = [ghosts("ideal", 0), ghosts("late", 6, existence=[0.0, 0.5, 0.9], ghosts_at=[6, 2, 0])]
+STEPS = [step("ideal", 1.0, 0.5), step("late", 0.4, 1.0), step("late", 0.7, 3.0)]
+
+
+def at_equal_ghosts(path: Path, per_min: float | None, *, lists: Sequence[Row] = LISTS, **of_late: Any) -> Comparison:
+    rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0, **of_late)]
+    return compared(path, rows, lists=lists, steps=STEPS, ghosts_per_min=per_min)
+
+
+@pytest.mark.parametrize(
+    ("per_min", "existence", "time_s"), [(6, 0.0, 1.0), (5.9, 0.5, 3.0), (2, 0.5, 3.0), (0, 0.9, 10.0)]
+)
+def test_times_are_at_the_lowest_threshold_with_so_few_ghosts(tmp_path, per_min, existence, time_s):
+    time = of(at_equal_ghosts(tmp_path, per_min), "ttd_rmst_s_equal_ghosts")
+    assert time["existence"] == existence
+    assert time["baseline_existence"] == 0.0
+    assert (time["value"], time["baseline_value"], time["difference"]) == (time_s, 0.5, time_s - 0.5)
+
+
+def test_the_rate_is_the_baselines_own_unless_given(tmp_path):
+    comparison = at_equal_ghosts(tmp_path, None)
+    assert comparison.ghosts_per_min == 0.0
+    assert of(comparison, "ttd_rmst_s_equal_ghosts")["existence"] == 0.9
+    back = compare([tmp_path / "study"], baseline="late")
+    assert back.ghosts_per_min == 6.0
+    assert of(back, "ttd_rmst_s_equal_ghosts")["difference"] == -0.5
+
+
+def test_an_entry_at_the_threshold_is_not_left_out(tmp_path):
+    lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.7], ghosts_at=[6, 2])]
+    assert of(at_equal_ghosts(tmp_path, 2, lists=lists), "ttd_rmst_s_equal_ghosts")["value"] == 3.0
+
+
+def test_who_is_no_longer_detected_counts_as_in_any_other_mean(tmp_path):
+    still = {"ended_by": "log_end", "ended_s": 7.0}
+    assert of(at_equal_ghosts(tmp_path, 0, **still), "ttd_rmst_s_equal_ghosts")["value"] == 7.0
+
+
+def test_more_ghosts_at_every_threshold_is_said(tmp_path):
+    lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.5], ghosts_at=[6, 2])]
+    comparison = at_equal_ghosts(tmp_path, 1, lists=lists)
+    time = of(comparison, "ttd_rmst_s_equal_ghosts")
+    assert pd.isna(time["difference"])
+    assert pd.isna(time["existence"])
+    assert time["baseline_value"] == 0.5
+    assert "late: more ghosts than that at every threshold: no ttd_rmst_s_equal_ghosts" in comparison.notes
+
+
+def test_the_threshold_is_that_of_all_logs_in_each_of_them(tmp_path):
+    rows = [row(name, 1.0, 30.0, log=log) for name in ("ideal", "late") for log in ("a", "b")]
+    steps = [step(name, 1.0, 1.0, log=log) for name in ("ideal", "late") for log in ("a", "b")]
+    lists = [ghosts("ideal", 2, log=log) for log in ("a", "b")]
+    lists += [
+        ghosts("late", n, log=log, existence=[0.0, 0.5, 0.8], ghosts_at=[n, at, 0])
+        for log, n, at in (("a", 9, 4), ("b", 1, 0))
+    ]
+    table = compared(tmp_path, rows, lists=lists, steps=steps).table
+    times = table[table["metric"] == "ttd_rmst_s_equal_ghosts"]
+    assert times["existence"].tolist() == [0.5, 0.5, 0.5]  # 2 a minute of both logs: 4 of `a` and none of `b`
+
+
+def test_the_same_folder_again_differs_in_nothing(tmp_path):
+    rng = np.random.default_rng(9)
+    where = [{"object_id": str(k), "run": run} for k in range(6) for run in range(2)]
+    rows = [
+        seen("x", [float(e) for e in rng.uniform(0, 2, 4)], [float(g) for g in rng.uniform(0, 4, 4)], ghosts=1, **w)
+        for w in where
+    ]
+    lists = [ghosts("x", 20 + run, run=run, existence=[0.0, 0.5], ghosts_at=[20 + run, 3]) for run in range(2)]
+    steps = [step("x", 0.9, 0.0, **w) for w in where]
+    folders = [write_folder(tmp_path / name, rows, lists=lists, steps=steps) for name in ("first", "second")]
+    comparison = compare(folders, baseline="first:x")
+    assert comparison.table["metric"].tolist() == [
+        "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
+        "ghosts_per_min",
+    ]  # fmt: skip
+    assert (comparison.table[["difference", "low", "high"]] == 0.0).all(axis=None)
+    assert comparison.notes == ()
