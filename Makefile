@@ -18,7 +18,11 @@ demo: .venv/.installed
 test: .venv/.installed
 	$(BIN)/python -m pytest -q -n 2
 
-bench: .venv/.installed
+.venv/.peers: .venv/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
+	touch $@
+
+bench: .venv/.peers
 	$(BIN)/python tools/bench.py
 
 check: .venv/.installed

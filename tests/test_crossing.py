@@ -28,7 +28,7 @@ from copem_replay.run import run
 
 ROOT = Path(__file__).resolve().parents[1]
 LOG = ROOT / "logs" / "crossing.mcap"
-EXPERIMENT = ROOT / "logs" / "crossing.yaml"
+EXPERIMENT = ROOT / "logs" / "crossing_units.yaml"
 FRAME_S = 0.1
 
 EGO, TRUCK_AHEAD, PARKED_VAN, BUS, TRUCK_ONCOMING, CYCLIST = 1, 3, 8, 10, 12, 15
@@ -336,6 +336,7 @@ def test_the_van_is_parked_and_the_bus_stops(scenes: list[Scene], stays: dict[in
 def table() -> pd.DataFrame:
     source = load(EXPERIMENT)
     source.data["runs"] = 10
+    source.data["measure"]["accuracy"] = False
     checked, found = problems(source)
     assert found == []
     assert checked is not None
@@ -414,3 +415,62 @@ def test_others_know_long_before_the_ego_of_who_gets_off_the_bus(table: pd.DataF
 def test_behind_the_van_hardly_anybody_sees_the_child(table: pd.DataFrame) -> None:
     part = table[table["object_id"] == str(CHILD)]
     assert (part.groupby("configuration")["time_to_detection_s"].median().drop("GT") > 1).all()
+
+
+# What fusions make of it --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fused() -> pd.DataFrame:
+    """The summary of crossing.yaml, of two runs, by configuration."""
+    source = load(ROOT / "logs" / "crossing.yaml")
+    source.data["runs"] = 2
+    checked, found = problems(source)
+    assert found == []
+    assert checked is not None
+    assert len(checked.shown()) == 4
+    recordings, refused = read_logs(checked, log_paths(source)[0], source)
+    assert refused == []
+    result = run(checked, recordings, jobs=2)
+    assert list(result.notes) == []
+    assert list(result.summary["configuration"]) == list(checked.configurations)
+    return result.summary.set_index("configuration")
+
+
+def test_the_fusions_hear_the_same_units(fused: pd.DataFrame) -> None:
+    assert (fused["detected_share"] == 1).all()
+    assert fused["list_rate_hz"].groupby(fused.index.str.endswith(":mixed")).nunique().tolist() == [1, 1]
+
+
+def test_the_better_a_fusion_the_fewer_duplicates(fused: pd.DataFrame) -> None:
+    """Nobody but ideal fusion knows what belongs together."""
+    for late in ("", ":mixed"):
+        names = [f"{name}{late}" for name in ("union", "nms:centre", "gnn", "ideal")]
+        for figure in ("duplicates_per_min", "gospa_m", "gospa_false_m"):
+            found = fused.loc[names, figure].tolist()
+            assert found == sorted(found, reverse=True), (late, figure)
+        alike = fused[fused.index.str.endswith(":mixed") == bool(late)]
+        assert alike["ghosts_per_min"].idxmin() == f"ideal{late}"
+
+
+def test_trackers_remember_and_so_miss_less(fused: pd.DataFrame) -> None:
+    for late in ("", ":mixed"):
+        for kind in ("stale", "predict", "replay"):
+            tracker = fused.loc[f"tracker:{kind}{late}"]
+            assert tracker["gospa_missed_m"] < fused.loc[f"ideal{late}", "gospa_missed_m"]
+            assert tracker["position_rmse_m"] < fused.loc[f"ideal{late}", "position_rmse_m"]
+            assert tracker["identity_switches"] > 0
+    others = fused[~fused.index.str.startswith("tracker")]
+    assert others["identity_switches"].isna().all()
+
+
+def test_late_lists_taken_for_new_ones_harm(fused: pd.DataFrame) -> None:
+    stale = fused.loc["tracker:stale:mixed", "position_rmse_m"]
+    assert fused.loc["tracker:predict:mixed", "position_rmse_m"] < stale
+    assert fused.loc["tracker:replay:mixed", "position_rmse_m"] < stale
+
+
+def test_covariance_intersection_claims_less(fused: pd.DataFrame) -> None:
+    """What it claims is larger, so that errors are smaller in its terms."""
+    assert fused.loc["gnn:CI", "nees"] < fused.loc["gnn", "nees"]
+    assert fused.loc["gnn:CI:mixed", "nees"] < fused.loc["gnn:mixed", "nees"]

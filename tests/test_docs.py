@@ -14,9 +14,11 @@ import pytest
 from copem_replay import cli
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, parse
+from copem_replay.fusion.component import StepFusion
 from copem_replay.pem.detection import DetectionModel
 from copem_replay.pem.look import Look
 from copem_replay.run import Result
+from copem_replay.testing import check_fusion
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -27,20 +29,26 @@ def test_readme_shows_what_its_commands_print(
 ) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     found = re.findall(r"<!-- output: (.*?) -->\n```text\n(.*?)```", text, re.DOTALL)
-    assert [command.split()[0] for command, _ in found] == ["copem-replay", "python"]
-    out = tmp_path / "results"
+    before = re.findall(r"<!-- before: (.*?) -->", text)
+    assert [command.split()[:2] for command in before] == [["copem-replay", "run"]]
+    assert [command.split()[0] for command, _ in found] == ["copem-replay", "python", "copem-replay"]
     monkeypatch.chdir(ROOT)
-    for command, expected in found:
-        words = [str(out) if word == "out/tc016d" else word for word in shlex.split(command)]
+
+    def printed(command: str) -> str:
+        words = [str(tmp_path / word) if word.startswith("out/") else word for word in shlex.split(command)]
         if words[0] == "python":
-            printed = subprocess.run([sys.executable, *words[1:]], check=True, capture_output=True, text=True).stdout
-        else:
-            monkeypatch.setattr("sys.argv", words)
-            with pytest.raises(SystemExit) as ended:
-                cli.main()
-            assert ended.value.code == 0
-            printed = capsys.readouterr().out
-        assert printed.replace(str(out), "out/tc016d") == expected
+            done = subprocess.run([sys.executable, *words[1:]], check=True, capture_output=True, text=True)
+            return done.stdout.replace(f"{tmp_path}/", "")
+        monkeypatch.setattr("sys.argv", words)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 0
+        return capsys.readouterr().out.replace(f"{tmp_path}/", "")
+
+    for command in before:
+        printed(command)
+    for command, expected in found:
+        assert printed(command) == expected
 
 
 def test_readme_experiment_loads(tmp_path: Path) -> None:
@@ -78,6 +86,17 @@ def test_own_model_of_the_architecture_page_works() -> None:
     one = np.ones(1)
     look = Look(one * 20, one, one, one, np.zeros(1, dtype=np.int8), one, one, one, one, one)
     assert fading(kind="page:Fading", half_range_m=20.0).probability(look) == pytest.approx(0.5)
+
+
+def test_own_fusion_of_the_fusion_page_works() -> None:
+    text = (ROOT / "docs/fusion.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    namespace: dict[str, object] = {"__name__": "page"}
+    exec(code, namespace)
+    surest = namespace["Surest"]
+    assert isinstance(surest, type)
+    assert issubclass(surest, StepFusion)
+    check_fusion(surest(kind="page:Surest"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,14 @@ from copem_replay.check import problems, read_logs
 from copem_replay.experiment_file import load
 from copem_replay.run import run
 from copem_replay.statistics import wilson
+from reports import reports_of
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data"
 sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
+import bench_fusion  # noqa: E402
 import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
@@ -69,7 +72,11 @@ def test_lidar_visibility_says_what_is_wrong() -> None:
         pytest.param("writing", {"mcap_objects_per_s", "rrd_boxes_per_s"}, marks=pytest.mark.long),
     ],
 )
-def test_benchmarks_print_json_lines(name: str, keys: set[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_benchmarks_print_json_lines(
+    name: str, keys: set[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How fast does not matter here: each is called once."""
+    monkeypatch.setattr(bench, "best", lambda work, times=5: bench._seconds(work))
     bench.main([name])
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     printed = {key for line in lines for key in line}
@@ -86,6 +93,68 @@ def test_the_benchmarks_plain_loop_reads_what_the_reader_reads(tmp_path: Path) -
     recording = read(tmp_path / "b.mcap", name="b")
     assert bench._plain_loop(tmp_path / "b.mcap") == len(recording.truth.frame_ix) == 35
     assert recording.truth.x_m[0] == pytest.approx(world.x_m[0])
+
+
+def once(work: Callable[[], object], _times: int) -> float:
+    return bench._seconds(work)
+
+
+def test_the_crossing_is_fused_by_each_configuration() -> None:
+    experiment, recordings = bench._loaded(ROOT / "logs/crossing.yaml")
+    some = {name: experiment.configurations[name] for name in ("ideal", "union", "tracker:replay:mixed")}
+    short = experiment.model_copy(update={"runs": 2, "configurations": some})
+    lines = list(bench_fusion.crossing(once, short, recordings[0]))
+    assert [line["algorithm"] for line in lines] == list(some)
+    for line in lines:
+        assert line["fusion_lists_per_s"] * line["us_per_list"] == pytest.approx(1e6, rel=0.01)
+        assert line["lists_per_s_two_threads"] > 0
+
+
+def test_what_units_report_in_fusion_benchmarks() -> None:
+    """The same as from its lists one by one; eight of ten objects are in each."""
+    told, truth = bench_fusion.scene(50, 4, 20)
+    lists = [told.lists.of(0, f) for f in range(80)]
+    units = [told.units[u] for u in told.unit_ix]
+    plain = reports_of([lists], units, told.captured_s.tolist(), told.arrives_s.tolist())
+    for name in ("unit_ix", "captured_s", "arrives_s", "issue_s", "newest", "arrived", "arrived_start"):
+        assert getattr(told, name).tolist() == getattr(plain, name).tolist(), name
+    assert told.lists.start.tolist() == plain.lists.start.tolist()
+    assert told.lists.entries.tobytes() == plain.lists.entries.tobytes()
+    assert told.lists.start[0, -1] == pytest.approx(0.8 * 4000, abs=4 * np.sqrt(4000 * 0.8 * 0.2))
+    assert truth[0].max() < 10 * np.sqrt(50)
+
+
+def test_only_equal_results_are_raced(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = bench_fusion.gnn_vs_numpy(once, (5,))
+    assert line["gnn_vs_numpy"] > 0
+    assert 0 <= line["max_dx_m"] < 1e-9
+    plain = bench_fusion.gnn_oracle.fuse
+    monkeypatch.setattr(bench_fusion.gnn_oracle, "fuse", lambda told, gate: plain(told, gate=0.5))
+    with pytest.raises(AssertionError):
+        list(bench_fusion.gnn_vs_numpy(once, (5,)))
+
+
+def test_stone_soup_is_a_peer_where_it_is_installed() -> None:
+    """GOSPA is equal; tracks are alike: about as many as objects, and near them."""
+    pytest.importorskip("stonesoup")
+    (line,) = bench_fusion.gospa_vs_stonesoup(once, 5)
+    assert line["gospa_vs_stonesoup"] > 0
+    assert line["max_difference_m"] < 1e-9
+    (line,) = bench_fusion.tracker_vs_stonesoup(once, 1, 3)
+    assert line["tracker_vs_stonesoup"] > 0
+    for who in ("", "stonesoup_"):
+        assert 14 <= line[f"{who}tracks"] <= 20
+        assert 0 < line[f"{who}nearest_rmse_m"] < 1
+        assert line[f"{who}nearest_rmse_m"] < line[f"{who}gospa_m"]
+
+
+def test_without_stone_soup_a_line_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "stonesoup"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "stonesoup", None)
+    why = "stonesoup is not installed: pip install '.[bench]'"
+    assert list(bench_fusion.gospa_vs_stonesoup(once)) == [{"gospa_vs_stonesoup": None, "why": why}]
+    assert list(bench_fusion.tracker_vs_stonesoup(once)) == [{"tracker_vs_stonesoup": None, "why": why}]
 
 
 def test_paper_counts_and_what_stands_beside_them() -> None:
@@ -130,7 +199,8 @@ def test_the_table_is_the_papers() -> None:
     assert experiment is not None
     assert (experiment.runs, experiment.seed) == (500, 1)
     recordings, _ = read_logs(experiment, [ROOT / "logs/tc016d.mcap"], None)
-    rows = run(experiment, recordings).summary.set_index("configuration")
+    times = experiment.measure.model_copy(update={"accuracy": False})
+    rows = run(experiment.model_copy(update={"measure": times}), recordings).summary.set_index("configuration")
     exact = rows["pass_share_exact"]
     for name, passed in paper.PASSED.items():
         low, high = wilson(passed, paper.RUNS)

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+import bench_fusion
 from copem_replay.check import problems, read_logs
 from copem_replay.experiment_file import load, log_paths
 from copem_replay.read import read
@@ -128,17 +129,16 @@ def writing() -> Iterator[dict[str, object]]:
     experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
     ready = prepare(recordings[0], experiment)
     beliefs = believed(ready, experiment, 0)
-    fused = {name: belief.fused for name, belief in beliefs.items()}
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
     rows, _ = summary(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
-    listed = sum(int(lists.valid.sum()) for lists in fused.values())
+    listed = sum(int(lists.fused.valid.sum()) for lists in beliefs.values())
     shown = listed + len(ready.truth.frame_ix)
     with _scratch() as folder:
         mcap, rrd = folder / "w.mcap", folder / "w.rrd"
         seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, beliefs, table, {}), 1)
         yield {"mcap_objects_per_s": round(listed / seconds)}
-        seconds = best(lambda: write_rrd(rrd, ready, experiment, fused, table, rows, 0), 3)
+        seconds = best(lambda: write_rrd(rrd, ready, experiment, beliefs, table, rows, 0), 3)
         yield {
             "rrd_boxes_per_s": round(shown / seconds),
             "rrd_bytes_per_box": round(rrd.stat().st_size / shown, 1),
@@ -162,6 +162,19 @@ def commands() -> Iterator[dict[str, object]]:
         seconds = best(lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 2)
         peak_kib = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         yield {"demo_s": round(seconds, 2), "demo_peak_mb": round(peak_kib / 1024)}
+
+
+def fusion() -> Iterator[dict[str, object]]:
+    """Fused lists per second on the crossing, and how the time of one grows; see bench_fusion.py."""
+    experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
+    yield from bench_fusion.crossing(best, experiment, recordings[0])
+    yield from bench_fusion.gnn_growth(best)
+
+
+def peers() -> Iterator[dict[str, object]]:
+    """Fusion and GOSPA against NumPy and SciPy, and against Stone Soup."""
+    for bench in (bench_fusion.gnn_vs_numpy, bench_fusion.gospa_vs_stonesoup, bench_fusion.tracker_vs_stonesoup):
+        yield from bench(best)
 
 
 def _loaded(path: Path):
@@ -224,7 +237,7 @@ def _plain_loop(path: Path) -> int:
     return len(pd.DataFrame(rows))
 
 
-BENCHES = (visibility, paper, reading, writing, commands)
+BENCHES = (visibility, paper, reading, writing, commands, fusion, peers)
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -1,0 +1,279 @@
+"""Benchmarks of fusion, called by bench.py, which says how to take a time. Each gives one line or more.
+
+Objects and units but those of the crossing: objects on straight ways, one to 100 m², twenty units that capture at one
+instant, ten times a second, and list each object with probability .8, its position ± 1 m per axis, nothing else of
+use (one class, no velocity), and no clutter.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta
+from operator import call
+from pathlib import Path
+
+import numba as nb
+import numpy as np
+
+from copem_replay.believe import World, _without_truth, listen, seen_by_all
+from copem_replay.experiment import Configuration, Experiment
+from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.gnn import Gnn
+from copem_replay.fusion.ideal import fuse
+from copem_replay.fusion.instants import instants
+from copem_replay.fusion.object_list import COVARIANCES, Lists, Reports, entries_of
+from copem_replay.fusion.reports import reports
+from copem_replay.fusion.tracker import Tracker
+from copem_replay.gospa import gospa, gospa_pairs
+from copem_replay.read import Recording
+from copem_replay.replay import blocks, prepare
+from copem_replay.tracks import CLASSES, Float, Tracks
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import gnn_oracle
+
+Best = Callable[[Callable[[], object], int], float]
+"""Seconds of the fastest of several calls."""
+Line = dict[str, object]
+
+PERIOD_S = 0.1
+GATE = 0.999
+_VAGUE_M2 = 1e6  # prior of a founding position: as good as none
+MISSING = {"why": "stonesoup is not installed: pip install '.[bench]'"}
+
+
+def scene(objects: int, units: int, count: int, seed: int = 0) -> tuple[Reports, Float]:
+    """What `units` report in one run at `count` instants, at once; where the objects are (count, objects, 2)."""
+    rng = np.random.default_rng(seed)
+    place, speed = rng.uniform(0, 10 * math.sqrt(objects), (objects, 2)), rng.normal(0, 2, (objects, 2))
+    now_s = np.arange(count) * PERIOD_S
+    truth = place + now_s[:, None, None] * speed
+    seen = rng.random((count, units, objects)) < 0.8
+    instant, unit, which = np.nonzero(seen)
+    entries = entries_of(len(which))
+    entries["x_m"], entries["y_m"] = (truth[instant, which] + rng.normal(size=(len(which), 2))).T
+    for name, variance in zip(COVARIANCES, (1.0, 0.0, 1.0), strict=True):
+        entries[name] = variance
+    entries["length_m"], entries["width_m"], entries["height_m"] = 4.5, 1.9, 1.5
+    entries["class_probability"][:, CLASSES.index("car")] = 1.0
+    entries["existence"], entries["captured_s"], entries["unit_ix"] = 0.9, now_s[instant], unit
+    start = np.concatenate([[0], np.cumsum(seen.sum(axis=2))])[None]
+    number, captured_s = np.arange(count * units), np.repeat(now_s, units)
+    told = Reports(
+        tuple(f"unit {u}" for u in range(units)), number % units, captured_s, captured_s, Lists(start, entries), now_s,
+        number.reshape(count, units), number, np.arange(count + 1) * units,
+    )  # fmt: skip
+    return told, truth
+
+
+# -------------------------------------------------------------------------------------------------------- the crossing
+
+
+def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterator[Line]:
+    """Fused lists per second in one thread and in two: two blocks of runs, cut as `run` cuts them.
+
+    Only the fusion: what units list, and when it arrives, is there before.
+    """
+    ready = prepare(recording, experiment)
+    world = ready.world(experiment)
+    cut = blocks(ready, experiment, 2)[:2]
+    seen = [seen_by_all(world, runs, states="sampled") for runs in cut]
+    told = [_without_truth(world, each, runs) for each, runs in zip(seen, cut, strict=True)]
+    with ThreadPoolExecutor(2) as pool:
+        for name, configuration in world.experiment.configurations.items():
+            parts = [_fusing(world, configuration, *each) for each in zip(seen, told, strict=True)]
+            work = [fused for fused, _ in parts]
+            count = parts[0][1] * sum(map(len, cut))
+            one = best(lambda work=work: list(map(call, work)), 2) / count
+            two = best(lambda work=work: list(pool.map(call, work)), 2) / count
+            yield {
+                "fusion_lists_per_s": round(1 / one),
+                "algorithm": name,
+                "us_per_list": round(one * 1e6, 1),
+                "lists_per_s_two_threads": round(1 / two),
+            }
+
+
+def _fusing(world: World, configuration: Configuration, seen: Tracks, told: Lists) -> tuple[Callable[[], object], int]:
+    """Fuses one block of runs as one configuration does; how many lists each run gets."""
+    heard = listen(seen, world.truth, world.experiment, configuration)
+    age_s, fusion = configuration.max_age_s, configuration.fusion
+    count = len(instants(heard, max_age_s=age_s).issue_s)
+    if isinstance(fusion, ListFusion):
+        ready = reports(heard, told, max_age_s=age_s)
+        return lambda: fusion.fuse(ready), count
+    return lambda: fuse(heard, max_age_s=age_s, without_object_ix=world.scene.ego_ix), count
+
+
+# -------------------------------------------------------------------------------------------------- nearest neighbours
+
+
+def gnn_vs_numpy(best: Best, sizes: tuple[int, ...] = (15, 160)) -> Iterator[Line]:
+    """Against the same algorithm in NumPy and SciPy, whose lists it has to give."""
+    ours = Gnn(gate=GATE)
+    for objects in sizes:
+        told, _ = scene(objects, 20, max(150 // objects, 2))
+        found, expected = ours.fuse(told), gnn_oracle.fuse(told, gate=GATE)
+        assert found.start.tolist() == expected.start.tolist(), "lists of other lengths"
+        off_m = max(float(np.abs(found.entries[c] - expected.entries[c]).max()) for c in ("x_m", "y_m"))
+        assert off_m < 1e-9, f"{off_m} m apart"
+        seconds = best(lambda told=told: ours.fuse(told), 20)
+        ratio = best(lambda told=told: gnn_oracle.fuse(told, gate=GATE), 3) / seconds
+        yield {
+            "gnn_vs_numpy": round(ratio, 1),
+            "objects": objects,
+            "units": 20,
+            "us_per_list": round(seconds / len(told.issue_s) * 1e6, 1),
+            "max_dx_m": off_m,
+        }
+
+
+def gnn_growth(best: Best) -> Iterator[Line]:
+    """How the time of a fused list grows with objects, at one density, and with units."""
+    ours = Gnn(gate=GATE)
+    took: dict[tuple[int, int], float] = {}
+    for objects, units in ((10, 20), (40, 5), (40, 10), (40, 20), (160, 20)):
+        told, _ = scene(objects, units, max(2000 // objects, 10))
+        took[objects, units] = best(lambda told=told: ours.fuse(told), 10) / len(told.issue_s) * 1e6
+        yield {"gnn_us_per_list": round(took[objects, units], 1), "objects": objects, "units": units}
+    yield {"gnn_growth": round(took[160, 20] / took[10, 20], 1), "bound_objects_squared": 256}
+    yield {"gnn_growth_with_units": round(took[40, 20] / took[40, 5], 2), "bound_units": 4}
+
+
+# -------------------------------------------------------------------------------------------------------------- a peer
+
+
+def gospa_vs_stonesoup(best: Best, pairs: int = 200) -> Iterator[Line]:
+    """GOSPA of 15 × 15 points, c = 5 m, p = 2, against Stone Soup's, states built before."""
+    try:
+        from stonesoup.metricgenerator.ospametric import GOSPAMetric
+        from stonesoup.types.state import State
+    except ImportError:
+        yield {"gospa_vs_stonesoup": None} | MISSING
+        return
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 10 * math.sqrt(15), (pairs, 15, 2))
+    believed = truth + rng.normal(size=truth.shape)
+    believed[:, 12:] = rng.uniform(0, 10 * math.sqrt(15), (pairs, 3, 2))  # three are missed, three are about nobody
+    at = datetime(2000, 1, 1)
+    states = [[[State(point, timestamp=at) for point in points] for points in both] for both in (truth, believed)]
+    metric = GOSPAMetric(p=2, c=5)
+
+    def theirs() -> list[float]:
+        several = zip(*states, strict=True)
+        return [metric.compute_gospa_metric(said, there)[0].value["distance"] for there, said in several]
+
+    columns = [np.ascontiguousarray(points.transpose(2, 0, 1)) for points in (truth, believed)]
+    off = float(np.abs(_gospas(*columns, 5.0, 2.0) - theirs()).max())
+    assert off < 1e-9, f"{off} m apart"
+    seconds = best(lambda: _gospas(*columns, 5.0, 2.0), 20)
+    yield {
+        "gospa_vs_stonesoup": round(best(theirs, 3) / seconds),
+        "gospa_per_s": round(pairs / seconds),
+        "points": 15,
+        "max_difference_m": off,
+    }
+
+
+@nb.njit(cache=True, nogil=True)
+def _gospas(truth: Float, believed: Float, cutoff_m: float, power: float) -> Float:
+    """GOSPA (N,) of each of several pairs of lists, points (2, N, n)."""
+    value_m, partner = np.empty(truth.shape[1]), np.empty(truth.shape[2], np.int64)
+    alone = cutoff_m**power / 2
+    for k in range(len(value_m)):
+        cost, count = gospa_pairs(
+            truth[0, k], truth[1, k], believed[0, k], believed[1, k], cutoff_m, power, partner
+        )  # fmt: skip
+        cost += alone * (truth.shape[2] + believed.shape[2] - 2 * count)
+        value_m[k] = cost ** (1 / power)
+    return value_m
+
+
+def tracker_vs_stonesoup(best: Best, scenes: int = 3, count: int = 6) -> Iterator[Line]:
+    """Tracks of 15 objects, lists of 20 units, against Stone Soup's two-dimensional assignment; and how good they are.
+
+    Both have the same motion model, gate and knowledge of a new track's speed, hear list after list, and forget what
+    was not heard of for long. Their assignments differ in what a pair costs (d, and d² + ln|S|), and ours merges what
+    is one object twice; so tracks are alike, not equal. How good: at the last instant, mean of all scenes.
+    """
+    ours = Tracker(late="predict", gate=GATE, confirm_s=0.0)
+    took: list[tuple[float, float]] = []
+    said: list[tuple[float, ...]] = []
+    for seed in range(scenes):
+        told, truth = scene(15, 20, count, seed)
+        try:
+            feed = _stonesoup(told)
+        except ImportError:
+            yield {"tracker_vs_stonesoup": None} | MISSING
+            return
+        found: list[Float] = []
+        seconds = best(lambda told=told: ours.fuse(told), 20)
+        took.append((seconds, best(lambda feed=feed, found=found: found.append(feed()), 1)))
+        last = ours.fuse(told).of(0, count - 1)
+        said.append(_quality(truth[-1], np.stack([last["x_m"], last["y_m"]], axis=1)) + _quality(truth[-1], found[-1]))
+    seconds, peer_seconds = np.mean(took, axis=0) / count
+    line: Line = {
+        "tracker_vs_stonesoup": round(peer_seconds / seconds),
+        "us_per_instant": round(seconds * 1e6, 1),
+        "stonesoup_us_per_instant": round(peer_seconds * 1e6),
+        "objects": 15,
+        "units": 20,
+    }
+    names = ("tracks", "nearest_rmse_m", "gospa_m")
+    keys = (*names, *(f"stonesoup_{name}" for name in names))
+    yield line | {key: round(float(value), 2) for key, value in zip(keys, np.mean(said, axis=0), strict=True)}
+
+
+def _stonesoup(told: Reports) -> Callable[[], Float]:
+    """Feeds Stone Soup's tracker all lists, made before, in order: where its tracks (n, 2) are in the end."""
+    from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
+    from stonesoup.deleter.time import UpdateTimeDeleter
+    from stonesoup.hypothesiser.distance import DistanceHypothesiser
+    from stonesoup.initiator.simple import SinglePointMeasurementInitiator
+    from stonesoup.measures import Mahalanobis
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+    from stonesoup.predictor.kalman import KalmanPredictor
+    from stonesoup.tracker.simple import MultiTargetTracker
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.state import GaussianState
+    from stonesoup.updater.kalman import KalmanUpdater
+
+    settings, began = Tracker(), datetime(2000, 1, 1)
+    axis = ConstantVelocity(settings.acceleration_psd_m2ps3)
+    predictor = KalmanPredictor(CombinedLinearGaussianTransitionModel([axis, axis]))
+    model = LinearGaussian(ndim_state=4, mapping=(0, 2), noise_covar=np.eye(2))
+    updater = KalmanUpdater(model)
+    gate = math.sqrt(-2 * math.log1p(-GATE))
+    associator = GNNWith2DAssignment(DistanceHypothesiser(predictor, updater, Mahalanobis(), missed_distance=gate))
+    spread = np.diag([_VAGUE_M2, settings.speed_sigma_mps**2] * 2)
+    prior = GaussianState(np.zeros((4, 1)), spread, timestamp=began)
+    lists = []
+    for f, captured_s in enumerate(told.captured_s.tolist()):
+        at, one = began + timedelta(seconds=captured_s), told.lists.of(0, f)
+        places = np.stack([one["x_m"], one["y_m"]], axis=1)
+        lists.append((at, {Detection(place, timestamp=at, measurement_model=model) for place in places}))
+
+    def feed() -> Float:
+        tracker = MultiTargetTracker(
+            initiator=SinglePointMeasurementInitiator(prior, model),
+            deleter=UpdateTimeDeleter(timedelta(seconds=1)),
+            detector=lists,
+            data_associator=associator,
+            updater=updater,
+        )
+        for _ in tracker:
+            pass
+        return np.array([track.state_vector[[0, 2], 0] for track in tracker.tracks], dtype=float)
+
+    return feed
+
+
+def _quality(truth: Float, found: Float) -> tuple[float, ...]:
+    """How many (m, 2) there are; RMS distance of each truth (n, 2) to the nearest, however many are left; GOSPA."""
+    squared = ((truth[:, None] - found) ** 2).sum(axis=2).min(axis=1)
+    return len(found), math.sqrt(squared.mean()), gospa(truth, found, cutoff_m=5.0, power=2.0).value_m
