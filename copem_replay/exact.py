@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.believe import listen
+from copem_replay.believe import by_truth, listen
 from copem_replay.braking.driver import Reaction
 from copem_replay.braking.verdict import pass_probability
 from copem_replay.detect import capture_instants
@@ -40,6 +40,7 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
             f"{replay.scene.log}: exact: perceived conflicts depend on sampled errors, and `brakes_for: "
             "conflict` has no closed form; use `brakes_for: object`, or leave `exact` out"
         )
+    _check_truth_ids(experiment)
     parts = []
     for name in experiment.configurations:
         columns = _columns(replay, experiment, name, distributions(replay, experiment, name))
@@ -49,9 +50,25 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+def _check_truth_ids(experiment: Experiment) -> None:
+    """Raises ExperimentError for a configuration of which it is not known how probable its detections are."""
+    for name, configuration in experiment.configurations.items():
+        recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
+        if not by_truth(configuration) or experiment.measure.match.always:
+            why = "what is matched with the truth depends on sampled errors"
+        elif recorded:
+            why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"
+        else:
+            continue
+        raise ExperimentError(f"exact: configuration {name}: {why}, which has no closed form; leave `exact` out")
+
+
 def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     """Raises ExperimentError for a configuration that has no closed form."""
-    if not experiment.measure.exact or experiment.measure.confirm.hits == 1:
+    if not experiment.measure.exact:
+        return
+    _check_truth_ids(experiment)
+    if experiment.measure.confirm.hits == 1:
         return
     for replay in ready:
         units = fleet_of(experiment, replay.scene).experiment

@@ -150,6 +150,8 @@ def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
         rows.track.append(item.header.tracking_id.value)
         vx, vy = (speed.x, speed.y) if speed is not None else (0.0, 0.0)
         x, y, z, yaw, vx, vy = _in_world(message, place.x, place.y, place.z, base.orientation.yaw, vx, vy)
+        if not base.HasField("position"):  # nowhere is not the origin
+            x = y = np.nan
         rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
         fast = spread.velocity.x if speed is not None else 0.0
         sigma = (spread.position.x, 0.0, spread.position.y, spread.orientation.yaw, spread.dimension.length, fast)

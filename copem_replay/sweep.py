@@ -87,6 +87,8 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
         return any(not _is_ego(unit) for unit in units)
     if kind == "latency_s" and isinstance(configuration.latency_s, dict):
         return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
+    if kind == "rate_hz":
+        return any(unit.recorded is None for unit in units)
     return kind != "share" or any(isinstance(unit.on, Carriers) for unit in units)
 
 

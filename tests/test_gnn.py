@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 import gnn_oracle
-from copem_replay.fusion.cluster_kernel import sort_rows
+from copem_replay.fusion.content_order import sort_rows
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.object_list import ENTRY, Entries, Lists, Reports, entries_of
 from copem_replay.tracks import CLASSES

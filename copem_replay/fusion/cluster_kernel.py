@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.assignment import assign_pairs
-from copem_replay.fusion.combine import covariance_intersection, fast_covariance_intersection
+from copem_replay.fusion.combine import covariance_intersection, fast_covariance_intersection, floored
+from copem_replay.fusion.content_order import compare_rows, sort_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
 from copem_replay.tracks import CLASSES, Bool, Float, Int
 
@@ -24,14 +25,8 @@ WIDTH = 13 + len(CLASSES)
 """So many numbers of an entry, from the first on, speak of the object; the rest of who says it when."""
 assert list(ENTRY.names or ())[13:15] == ["class_probability", "captured_s"]
 
-SMALLEST_VARIANCE = 1e-9
-"""Eigenvalues of position covariances below this count as this (m²; the contract's)."""
-_FLATTEST = 1e-12
-"""Nor is one below this share of the other (chosen): determinants of flatter ellipses are rounding."""
 _OPPOSED = 1e-9
 """Yaws whose mean vector is shorter than this cancel out (chosen: rounding)."""
-_BLOCK = 16
-"""So many rows are sorted by insertion before blocks are merged (chosen)."""
 _SURPLUS = 1e-9
 """By how much the dearest allowed pair beats none (chosen: any positive number does)."""
 
@@ -133,50 +128,6 @@ def intersect(clusters: Clusters, by_determinant: bool, fast: bool, fused: Entri
         fused[c].cov_ee_m2, fused[c].cov_en_m2, fused[c].cov_nn_m2 = P[0, 0], P[0, 1], P[1, 1]
 
 
-# ---------------------------------------------------------------- an order that depends on content only
-
-
-@nb.njit(cache=True, nogil=True)
-def sort_rows(values: Float, order: Int) -> None:
-    """Sort `order`, indices of rows of `values (N, V)`, by the first column, then the second …; in place, stably."""
-    n = len(order)
-    # The first column nearly always decides: it is kept at hand.
-    key, other_key, other = np.empty(n), np.empty(n), np.empty(n, np.int64)
-    for p in range(n):
-        x, r, at = values[order[p], 0], order[p], p
-        while at % _BLOCK > 0 and (x < key[at - 1] or (x == key[at - 1] and _compare(values, r, order[at - 1]) < 0)):
-            key[at], order[at] = key[at - 1], order[at - 1]
-            at -= 1
-        key[at], order[at] = x, r
-    block = _BLOCK
-    while block < n:
-        for left in range(0, n, 2 * block):
-            middle, right = min(left + block, n), min(left + 2 * block, n)
-            i, j = left, middle
-            for p in range(left, right):
-                later = j < right and i < middle
-                if later:
-                    later = key[j] < key[i] or (key[j] == key[i] and _compare(values, order[j], order[i]) < 0)
-                if later or i == middle:
-                    other_key[p], other[p] = key[j], order[j]
-                    j += 1
-                else:
-                    other_key[p], other[p] = key[i], order[i]
-                    i += 1
-        for p in range(n):
-            key[p], order[p] = other_key[p], other[p]
-        block *= 2
-
-
-@nb.njit(cache=True, nogil=True)
-def _compare(values: Float, a: int, b: int) -> int:
-    """−1, 0 or 1 as row a comes before row b, is the same, or comes after."""
-    for v in range(values.shape[1]):
-        if values[a, v] != values[b, v]:
-            return -1 if values[a, v] < values[b, v] else 1
-    return 0
-
-
 @nb.njit(cache=True, nogil=True)
 def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_existence: float) -> tuple[Points, Int]:
     """Entries that count, list by list, in order of content, (M,), and where those of each list begin, (F + 1,)."""
@@ -198,26 +149,10 @@ def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_exis
         for i in range(first[f], first[f + 1]):
             point, entry = points[i], entries[rows[i]]
             point.x_m, point.y_m = entry.x_m, entry.y_m
-            point.ee, point.en, point.nn = _floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
+            point.ee, point.en, point.nn = floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
             point.kind = np.argmax(entry.class_probability)
             point.row, point.list = rows[i], f
     return points, first
-
-
-@nb.njit(cache=True, nogil=True)
-def _floored(ee: float, en: float, nn: float) -> tuple[float, float, float]:
-    """The same covariance with no eigenvalue below the least."""
-    least = max(SMALLEST_VARIANCE, _FLATTEST * (ee + nn))
-    if ee >= least and (ee - least) * (nn - least) >= en * en:
-        return ee, en, nn
-    half = (ee - nn) / 2
-    radius = np.hypot(half, en)
-    high = (ee + nn) / 2 + radius
-    if radius == 0 or high <= least:
-        return least, 0.0, least
-    # Eigenvectors stay: they are those of (half, en) over its length.
-    middle, scale = (least + high) / 2, (high - least) / 2 / radius
-    return middle + half * scale, en * scale, middle - half * scale
 
 
 @nb.njit(cache=True, nogil=True)
@@ -248,7 +183,7 @@ def _list_before(
     if n != m:
         return bool(n > m)
     for i in range(n):
-        order = _compare(content, points[first[f] + i].row, points[first[g] + i].row)
+        order = compare_rows(content, points[first[f] + i].row, points[first[g] + i].row)
         if order != 0:
             return order < 0
     return bool(arrives_s[f] < arrives_s[g])

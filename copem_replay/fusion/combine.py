@@ -10,10 +10,33 @@ All in one file, because Numba's cache on disk only notices changes in the file 
 
 from __future__ import annotations
 
+import math
+
 import numba as nb
 import numpy as np
 
 from copem_replay.tracks import Bool, Float
+
+SMALLEST_VARIANCE_M2 = 1e-9
+"""Eigenvalues of a measurement's covariance below this count as this (the contract's)."""
+_FLATTEST = 1e-12
+"""No eigenvalue counts as less than this share of the other (chosen): rounding could make it negative."""
+
+
+@nb.njit(cache=True, nogil=True)
+def floored(ee: float, en: float, nn: float) -> tuple[float, float, float]:
+    """The covariance with the same axes whose eigenvalues are not too small."""
+    middle, half = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
+    high = max(middle + half, SMALLEST_VARIANCE_M2)
+    low = max(middle - half, SMALLEST_VARIANCE_M2, _FLATTEST * high)
+    if low <= middle - half:
+        return ee, en, nn
+    if half == 0.0:
+        return high, 0.0, high
+    c2, s2 = (ee - nn) / 2 / half, en / half
+    middle, half = (high + low) / 2, (high - low) / 2
+    return middle + half * c2, half * s2, middle - half * c2
+
 
 _GAP = 1e-12
 """The optimum is found when no input could lower the criterion by more than this share of it (chosen)."""

@@ -82,6 +82,9 @@ class StepFusion(ListFusion):
             start[s, 0] = total
             for k in range(instants):
                 entries, memory = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memory)
+                if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY or entries.ndim != 1:
+                    found = entries.dtype.name if isinstance(entries, np.ndarray) else type(entries).__name__
+                    raise TypeError(f"step: expected a list (an array of ENTRY) and a memory, found {found}")
                 parts.append(entries)
                 total += len(entries)
                 start[s, k + 1] = total

@@ -9,8 +9,9 @@ import numpy as np
 
 from copem_replay.components import Positive, Share
 from copem_replay.fusion.agree import AGREE
-from copem_replay.fusion.cluster_kernel import WIDTH, sort_rows
+from copem_replay.fusion.cluster_kernel import WIDTH
 from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.content_order import sort_rows
 from copem_replay.fusion.gnn import numbers
 from copem_replay.fusion.object_list import Entries, Lists, Reports
 from copem_replay.fusion.overlap import rotated_iou

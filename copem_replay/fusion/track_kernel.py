@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.assignment import assign_pairs
-from copem_replay.fusion.cluster_kernel import sort_rows
+from copem_replay.fusion.combine import floored
+from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
-from copem_replay.fusion.track_filter import distance2, floored, predict, update
+from copem_replay.fusion.track_filter import distance2, predict, update
 from copem_replay.tracks import CLASSES, SAME_INSTANT_NS, Bool, Float, Int
 
 STALE, PREDICT, REPLAY = 0, 1, 2
@@ -369,23 +370,6 @@ def _younger(tracks: NDArray[Any], i: int, j: int) -> int:
 
 
 @nb.njit(cache=True, nogil=True)
-def rows_in_order(start: Int, content: Float) -> Int:
-    """Indices of the entries (N,), list by list, in order of their content, place first."""
-    rows = np.arange(start[-1])
-    for f in range(len(start) - 1):
-        sort_rows(content, rows[start[f] : start[f + 1]])
-    return rows
-
-
-@nb.njit(cache=True, nogil=True)
-def _compared(content: Float, r: int, s: int) -> int:
-    for c in range(content.shape[1]):
-        if content[r, c] != content[s, c]:
-            return -1 if content[r, c] < content[s, c] else 1
-    return 0
-
-
-@nb.njit(cache=True, nogil=True)
 def _comes_before(said: Said, f: int, g: int) -> bool:
     if said.captured_s[f] != said.captured_s[g]:
         return bool(said.captured_s[f] < said.captured_s[g])
@@ -393,7 +377,7 @@ def _comes_before(said: Said, f: int, g: int) -> bool:
     if n != m:
         return bool(n > m)
     for k in range(n):
-        order = _compared(said.content, said.rows[said.start[f] + k], said.rows[said.start[g] + k])
+        order = compare_rows(said.content, said.rows[said.start[f] + k], said.rows[said.start[g] + k])
         if order != 0:
             return bool(order < 0)
     # They say the same: which of them is first only decides whose the track is said to be.

@@ -11,8 +11,9 @@ from pydantic import Field, model_validator
 from copem_replay.components import NotNegative, Positive, Share
 from copem_replay.fusion.agree import AGREE
 from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.content_order import rows_in_order
 from copem_replay.fusion.object_list import ENTRY, Lists, Reports
-from copem_replay.fusion.track_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run, rows_in_order
+from copem_replay.fusion.track_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
 from copem_replay.fusion.union import run_after_run
 from copem_replay.resample import wrap
 from copem_replay.tracks import Float
