@@ -109,8 +109,10 @@ class Slot:
             except PydanticCustomError:  # an entry point of another package that is broken: not to be had
                 continue
             found = deepcopy(handler.resolve_ref_schema(handler(component.__pydantic_core_schema__)))
-            found["properties"]["kind"] = {"const": kind}
-            if kind != self.default:
+            if kind == self.default:
+                found["properties"]["kind"] = {"const": kind, "default": kind}
+            else:
+                found["properties"]["kind"] = {"const": kind}
                 found["required"] = sorted({*found.get("required", []), "kind"})
             alternatives.append(found)
         own = {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]}

@@ -127,6 +127,7 @@ _EXPECTED = {
     "greater_than_equal": "at least {ge:g}",
     "less_than": "less than {lt:g}",
     "less_than_equal": "at most {le:g}",
+    "string_too_short": "at least {min_length} character",
     "too_short": "at least {min_length} in the list",
     "too_long": "at most {max_length} in the list",
     "literal_error": "{expected}",
@@ -174,9 +175,14 @@ def _names_at(key: Key, data: Any) -> list[str]:
             inner = [p.get("properties", {}).get(step) or p.get("additionalProperties") for p in places]
         places = [found for part in inner for found in alternatives(part)]
     names = [place["properties"] for place in places if "properties" in place]
-    kinds = [(p.get("kind", {}).get("const"), *p.get("kind", {}).get("enum", ())) for p in names]
-    meant = [place for place, known in zip(names, kinds, strict=True) if data.get("kind") in known]
+    meant = [place for place in names if _is_meant(place.get("kind", {}), data.get("kind"))]
     return sorted({name for place in meant or names for name in place})
+
+
+def _is_meant(kinds: Mapping[str, Any], kind: object) -> bool:
+    """Whether keys go with `kind:` as the file says it, or leaves it to the default."""
+    known = [kinds["const"]] if "const" in kinds else kinds.get("enum", [])
+    return kind in known or (kind is None and "default" in kinds)
 
 
 def _short(value: object) -> str:

@@ -31,7 +31,7 @@ def references(source: Source) -> Iterator[str]:
     if isinstance(measure, dict):
         place = measure.get("distance_to", "ego")
         unit = dict(_items(data.get("units"))).get(str(place), {})
-        if unit.get("recorded") is not None and unit.get("at") is None and unit.get("on") is None:
+        if place != "ego" and unit.get("recorded") is not None and unit.get("at") is None and unit.get("on") is None:
             yield source.at(
                 ("measure", "distance_to"), f"unit {place!r} has no place; say `at: [x, y]` or `on: <object id>` of it"
             )
