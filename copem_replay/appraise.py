@@ -8,11 +8,11 @@ import numpy as np
 
 from copem_replay.accuracy import Accuracy, Settings, assess, for_runs
 from copem_replay.believe import Believed
-from copem_replay.detect import Detections, shortest_period_s
+from copem_replay.detect import Detections
 from copem_replay.experiment import Experiment
 from copem_replay.fusion.agree import AGREE
 from copem_replay.match import Matches, match
-from copem_replay.matched import Steps, first_matches
+from copem_replay.matched import Steps, captures_of, first_matches
 from copem_replay.measure_keys import Measure
 from copem_replay.onset import Looks, Reference, measured_objects, reference_at
 from copem_replay.resample import at_instants
@@ -85,13 +85,11 @@ def match_lists(around: Surroundings, believed: Believed, measure: Measure) -> M
 
 def appraise(around: Surroundings, looks: Looks, believed: Believed, measure: Measure, runs: int) -> Appraisal:
     """Match a configuration's lists in so many runs with the truth, and measure them."""
-    issue_s, newest = believed.at.issue_s, believed.at.newest
+    issue_s = believed.at.issue_s
     matches = match_lists(around, believed, measure)
-    captured_s = np.where(newest >= 0, believed.heard.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
     detections, steps = first_matches(
         believed.lists, matches, issue_s, looks,
-        confirm=measure.confirm, count_earlier=measure.count_earlier, list_captured_s=captured_s,
-        period_s=shortest_period_s(believed.heard),
+        confirm=measure.confirm, count_earlier=measure.count_earlier, captures=captures_of(believed.heard),
     )  # fmt: skip
     accuracy = None
     if measure.accuracy:

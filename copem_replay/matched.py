@@ -1,9 +1,9 @@
 """When did the receiver first know of an object? By match: for fusions that go without truth ids.
 
 Known by the first list with a match of the object (`match.py`) that was captured at or after the onset and is
-available before looking ends. `confirm` counts captures, not messages: `hits` of the last `of` capture instants hold
-such a match, in whichever of their lists. A list belongs to the newest capture that the receiver has had; captures
-within half a list period of the first one of a capture instant belong to that instant.
+available before looking ends. `confirm` counts captures, not messages, by the rules of `detect.py`: an entry about the
+object, a match or a duplicate of one, says that the capture it goes back to holds the object, however often it is
+issued again.
 
 How surely it was known: had entries below some existence not been listed, the detection would have come later, or
 never. `Steps` says when, for every existence.
@@ -17,12 +17,12 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.detect import Detections
+from copem_replay.detect import Detections, capture_instants
 from copem_replay.fusion.object_list import Entries, Lists
-from copem_replay.match import MATCH, Matches
+from copem_replay.match import DUPLICATE, MATCH, Matches
 from copem_replay.measure_keys import Confirm
 from copem_replay.onset import Looks
-from copem_replay.tracks import SAME_INSTANT_NS, Float, Int
+from copem_replay.tracks import SAME_INSTANT_NS, Float, Int, Tracks
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
@@ -41,6 +41,23 @@ class Steps:
     detection_s: Float
 
 
+@dataclass(frozen=True)
+class Captures:
+    """When units made their lists, unit by unit and in order of time: (F,) each; `instant` numbers capture instants."""
+
+    captured_s: Float
+    unit_ix: Int
+    instant: Int
+
+
+def captures_of(heard: Tracks) -> Captures:
+    """The captures behind the lists that were heard."""
+    came = np.isfinite(heard.arrives_s[0])
+    order = np.flatnonzero(came)
+    order = order[np.lexsort((heard.captured_s[order], heard.frame_unit_ix[order]))]
+    return Captures(heard.captured_s[order], heard.frame_unit_ix[order], capture_instants(heard)[order])
+
+
 def first_matches(
     lists: Lists,
     matches: Matches,
@@ -49,23 +66,23 @@ def first_matches(
     *,
     confirm: Confirm,
     count_earlier: bool,
-    list_captured_s: Float,
-    period_s: float | None = None,
+    captures: Captures,
 ) -> tuple[Detections, Steps]:
     """First detection of each of M looks in S runs, and how it depends on the existence asked for.
 
-    `issue_s (K,)`: when each list is available, ascending; `list_captured_s (K,)`: the newest capture the receiver then
-    had. `period_s`: the units' shortest list period; None: the median spacing of the captures, the same with one unit.
-    The captured instant and the first unit are those of the entry.
+    `issue_s (K,)`: when each list is available, ascending; `captures`: what entries go back to. The captured instant and
+    the first unit are those of the entry.
     """
     look_of = np.full(int(max(looks.object_ix.max(initial=-1), matches.object_ix.max(initial=-1))) + 1, -1)
     look_of[looks.object_ix] = np.arange(len(looks.object_ix))
     not_before_s = np.full(len(looks.object_ix), -np.inf) if count_earlier else looks.onset_s - _TOLERANCE_S
     level = np.full(len(lists.entries), np.nan)
-    instant = capture_instants(list_captured_s, period_s)
+    # One hit confirms at once, whatever the captures.
+    source = _sources(lists.entries, captures) if confirm.hits > 1 else np.zeros((0, 2), dtype=np.int64)
     _levels(
-        lists.start, lists.entries, matches.object_ix, matches.role, issue_s, instant, look_of, not_before_s,
-        looks.ended_s + _TOLERANCE_S, confirm.hits, confirm.of, level,
+        lists.start, lists.entries, matches.object_ix, matches.role, issue_s, source, captures.unit_ix,
+        int(captures.instant.max(initial=-1)) + 1, look_of, not_before_s, looks.ended_s + _TOLERANCE_S,
+        confirm.hits, confirm.of, level,
     )  # fmt: skip
     entry = np.flatnonzero(~np.isnan(level))
     # Of empty lists, which begin where the next does, the last is the one that holds the entry.
@@ -84,62 +101,103 @@ def first_matches(
     return found, steps
 
 
-def capture_instants(list_captured_s: Float, period_s: float | None = None) -> Int:
-    """(K,) the capture instant each list belongs to, counted from the first; never one before that of the last list."""
-    captured_s = np.maximum.accumulate(list_captured_s)
-    if period_s is None:
-        apart_s = np.diff(captured_s[np.isfinite(captured_s)])
-        apart_s = apart_s[apart_s > _TOLERANCE_S]
-        period_s = float(np.median(apart_s)) if len(apart_s) else 0.0
-    instant = np.zeros(len(captured_s), dtype=np.int64)
-    _cluster(captured_s, period_s / 2 + _TOLERANCE_S, instant)
-    return instant
+def _sources(entries: Entries, captures: Captures) -> Int:
+    """(i, 2) the capture instant and the list each entry goes back to, −1: none.
 
-
-@nb.njit(cache=True, nogil=True)
-def _cluster(captured_s: Float, reach_s: float, out: Int) -> None:
-    first = 0
-    for k in range(1, len(captured_s)):
-        out[k] = out[k - 1]
-        if captured_s[k] > captured_s[first] + reach_s:
-            out[k] += 1
-            first = k
+    That of its unit where it made one then, else the first unit's; an entry that says it was captured at another time
+    goes back to the instant before, and to no list.
+    """
+    captured_s = entries["captured_s"]
+    by_time = np.argsort(captures.captured_s, kind="stable")
+    ordered_s = captures.captured_s[by_time]
+    before = np.searchsorted(ordered_s, captured_s + _TOLERANCE_S, side="right") - 1
+    instant = np.where(before >= 0, captures.instant[by_time[before]], -1) if len(by_time) else before
+    made = np.full(len(entries), -1)
+    units = np.unique(captures.unit_ix)
+    for own in (True, False):
+        for unit in units:
+            first, last = np.searchsorted(captures.unit_ix, (unit, unit + 1))
+            asked = np.flatnonzero((made < 0) & (entries["unit_ix"] == unit)) if own else np.flatnonzero(made < 0)
+            at = np.searchsorted(captures.captured_s[first:last], captured_s[asked] - _TOLERANCE_S) + first
+            there = at < last
+            there[there] = captures.captured_s[at[there]] <= captured_s[asked[there]] + _TOLERANCE_S
+            made[asked[there]] = at[there]
+    instant = np.where(made >= 0, captures.instant[made], instant) if len(by_time) else instant
+    return np.stack([instant, made], axis=1)
 
 
 @nb.njit(cache=True, nogil=True)
 def _levels(
-    start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, instant: Int, look_of: Int,
-    not_before_s: Float, until_s: Float, hits: int, of: int, level: Float,
+    start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, source: Int,
+    unit_of_list: Int, instants: int, look_of: Int, not_before_s: Float, until_s: Float, hits: int, of: int,
+    level: Float,
 ) -> None:  # fmt: skip
     # At each entry that makes one known at a higher existence than before: that existence.
     M = len(until_s)
     best = np.empty(M)
-    # The last `of` capture instants that hold a match of each look, in a ring, and the highest existence of each.
-    when, highest = np.empty((M, of), dtype=np.int64), np.empty((M, of))
+    # The highest existence with which each capture instant, and each unit's list, holds the object of each look.
+    by_instant, by_list = np.empty((M, instants)), np.empty((M, len(unit_of_list)))
+    nobody = np.zeros(instants, dtype=np.int64)
     held = np.empty(of)
+    # What one fused list says of the looks in it, and the entry that stands for it.
+    touched, reached, standing = np.empty(M, dtype=np.int64), np.empty(M), np.full(M, -1)
     for s in range(len(start)):
-        best[:], when[:] = -np.inf, -1
+        best[:] = -np.inf
+        if hits > 1:
+            by_instant[:], by_list[:] = -np.inf, -np.inf
         for k in range(len(issue_s)):
+            n = 0
             for i in range(start[s, k], start[s, k + 1]):
-                m = look_of[object_ix[i]] if role[i] == MATCH else -1
+                about = role[i] == MATCH or (hits > 1 and role[i] == DUPLICATE)
+                m = look_of[object_ix[i]] if about else -1
                 if m < 0 or issue_s[k] > until_s[m] or entries[i].captured_s < not_before_s[m]:
                     continue
                 existence = entries[i].existence
-                if hits > 1:
-                    place = instant[k] % of
-                    if when[m, place] != instant[k]:
-                        when[m, place], highest[m, place] = instant[k], existence
-                    highest[m, place] = max(highest[m, place], existence)
-                    if existence <= best[m]:
-                        continue  # of those above the best there are no more than before
-                    n = 0
-                    for q in range(of):
-                        if when[m, q] >= 0 and when[m, q] > instant[k] - of:
-                            held[n] = highest[m, q]
-                            n += 1
-                    if n < hits:
-                        continue
-                    held[:n].sort()
-                    existence = held[n - hits]
-                if existence > best[m]:
-                    best[m] = level[i] = existence
+                if standing[m] < 0:
+                    touched[n], standing[m], reached[m] = m, i, -np.inf
+                    n += 1
+                elif _stands_before(entries, role, i, standing[m]):
+                    standing[m] = i
+                if hits == 1:
+                    reached[m] = existence
+                    continue
+                instant, made = source[i]
+                if instant >= 0 and existence > by_instant[m, instant]:
+                    by_instant[m, instant] = existence
+                    reached[m] = max(reached[m], _confirmed(by_instant[m], instant, hits, of, nobody, held))
+                if made >= 0 and existence > by_list[m, made]:
+                    by_list[m, made] = existence
+                    reached[m] = max(reached[m], _confirmed(by_list[m], made, hits, of, unit_of_list, held))
+            for m in touched[:n]:
+                if reached[m] > best[m]:
+                    best[m] = level[standing[m]] = reached[m]
+                standing[m] = -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _stands_before(entries: Entries, role: NDArray[np.int8], i: int, j: int) -> bool:
+    # Of two entries about one object: the match, the surer, the newer, the first unit's.
+    one, other = entries[i], entries[j]
+    if role[i] != role[j]:
+        return bool(role[i] < role[j])
+    if one.existence != other.existence:
+        return bool(one.existence > other.existence)
+    if one.captured_s != other.captured_s:
+        return bool(one.captured_s > other.captured_s)
+    return bool(one.unit_ix < other.unit_ix)
+
+
+@nb.njit(cache=True, nogil=True)
+def _confirmed(existence: Float, at: int, hits: int, of: int, group: Int, held: Float) -> float:
+    # With at most which existence do `hits` of some `of` consecutive captures of a group, this one among them, hold it?
+    found = -np.inf
+    for first in range(max(at - of + 1, 0), at + 1):
+        n = 0
+        for q in range(first, min(first + of, len(existence))):
+            if group[q] == group[at] and existence[q] > -np.inf:
+                held[n] = existence[q]
+                n += 1
+        if n >= hits:
+            held[:n].sort()
+            found = max(found, held[n - hits])
+    return found

@@ -89,6 +89,30 @@ def test_what_one_unit_detects_its_company_detects_too_and_not_later(
         assert not (late[alone["detected"]] > 1e-9).any()
 
 
+@given(onset=onsets, confirm=confirms, ego_rate=rates, other_rate=rates, late=latencies, later=latencies)
+@MANY
+def test_where_nothing_can_be_confused_union_detects_as_ideal_does(
+    onset: Any, confirm: Any, ego_rate: Any, other_rate: Any, late: float, later: float
+) -> None:
+    """By match and by truth id alike, confirmations included, whatever the units' rates and latencies."""
+    things = [Thing("ego", "car", driving(0, 0, 5))]
+    things += [Thing(f"o{k}", "pedestrian", driving(20 + 15 * k, 9.0 * k, 1.0, 0.5)) for k in range(3)]
+    latency = {"ego": late, "default": later}
+    plan = experiment(
+        runs=8,
+        pems=PEMS,
+        units=units(ego_rate, other_rate),
+        configurations={
+            "ideal": {"units": "all", "latency_s": latency},
+            "union": {"units": "all", "latency_s": latency, "fusion": {"kind": "union"}},
+        },
+        measure={"onset": onset, "confirm": confirm},
+    )
+    table = run(plan, [recording(things, until_s=3.0)]).table
+    ideal, union = by_row(table, "ideal"), by_row(table, "union")
+    pd.testing.assert_series_equal(ideal["detection_s"], union["detection_s"])
+
+
 @given(log=logs(), onset=onsets, latency=latencies, ego_rate=rates)
 @MANY
 def test_latency_moves_every_detection_by_exactly_itself_or_past_the_end(
