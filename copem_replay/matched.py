@@ -70,8 +70,8 @@ def first_matches(
 ) -> tuple[Detections, Steps]:
     """First detection of each of M looks in S runs, and how it depends on the existence asked for.
 
-    `issue_s (K,)`: when each list is available, ascending; `captures`: what entries go back to. The captured instant and
-    the first unit are those of the entry.
+    `issue_s (K,)`: when each list is available, ascending; `captures`: what entries go back to. The captured instant
+    and the first unit are those of the entry.
     """
     look_of = np.full(int(max(looks.object_ix.max(initial=-1), matches.object_ix.max(initial=-1))) + 1, -1)
     look_of[looks.object_ix] = np.arange(len(looks.object_ix))

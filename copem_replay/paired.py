@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from copem_replay.statistics import expanded_tail
 from copem_replay.tracks import Float, Int
 
 _CELLS = 4_000_000
@@ -113,23 +114,23 @@ def resampled_medians(values: Float, cluster: Int, count: NDArray[np.unsignedint
     return np.where(total > 0, found, np.nan)
 
 
-def percentile_limits(values: Float, *, confidence: float = 0.95) -> tuple[float, float]:
-    """The (1 ∓ confidence)/2 quantiles of resampled figures (R,), linear between neighbours: (low, high).
+def percentile_limits(values: Float, *, clusters: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Quantiles of figures (R,) resampled over so many clusters, linear between neighbours: (low, high).
+
+    At the levels of a confidence, widened for few clusters (`statistics.expanded_tail`).
 
     NaN among them had nothing to give and are left out; both limits are NaN where nothing is left. An infinite limit,
     or NaN between −∞ and ∞, says that there is none.
 
-    Raises ValueError for `confidence` outside (0, 1).
+    Raises ValueError for `confidence` outside (0, 1), no cluster.
 
     Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981) 139–158
     (percentile method).
     """
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"expected a confidence between 0 and 1, ends excluded, found {confidence}")
+    tail = expanded_tail(confidence, clusters)
     ranked = np.sort(values[~np.isnan(values)])
     if not len(ranked):
         return math.nan, math.nan
-    tail = (1.0 - confidence) / 2
     low, high = (_between(ranked, level * (len(ranked) - 1)) for level in (tail, 1.0 - tail))
     return low, high
 

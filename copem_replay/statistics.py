@@ -192,9 +192,9 @@ def bootstrap_share(
     `successes (K,)` of `totals (K,)` in each cluster, 0 ≤ successes ≤ totals; a total may be 0.
     `uniform (resamples, K)`: independent numbers in (0, 1), one per resample and place; u draws
     cluster ⌊u·K⌋.
-    Resamples whose total is 0 have no share and are left out. The limits are the (1 ∓ confidence)/2 quantiles
-    of the resampled shares, linear between neighbours: so the interval of the failures is the mirror image,
-    and no limit jumps to the next resample because a level is rounded.
+    Resamples whose total is 0 have no share and are left out. The limits are quantiles of the resampled shares, at
+    levels widened for few clusters (`expanded_tail`), linear between neighbours: so the interval of the failures is
+    the mirror image, and no limit jumps to the next resample because a level is rounded.
 
     Raises ValueError for no clusters, for other shapes or values than said, for `confidence` outside (0, 1),
     and when no resample has a share.
@@ -209,7 +209,7 @@ def bootstrap_share(
         raise ValueError(f"bootstrap_share: expected uniform of {(resamples, K)}, found {uniform.shape}")
     if not ((uniform > 0) & (uniform < 1)).all():
         raise ValueError("bootstrap_share: expected uniform numbers between 0 and 1, ends excluded")
-    tail = _tail(confidence)
+    tail = expanded_tail(confidence, K)
     sums = np.zeros((resamples, 2), dtype=np.int64)
     # One resample at a time: the indices of all would need the memory of `uniform` once more, and so would
     # what they fetch.
@@ -221,6 +221,28 @@ def bootstrap_share(
         raise ValueError("bootstrap_share: expected a total above 0, found none in any resample")
     low, high = np.quantile(sums[:, 0] / sums[:, 1], (tail, 1.0 - tail), method="linear")
     return float(low), float(high)
+
+
+def expanded_tail(confidence: float, clusters: int) -> float:
+    """The probability beyond each limit of a percentile interval over so many clusters; below (1 − confidence)/2.
+
+    A resample of K clusters varies less than K fresh ones would, by √((K − 1)/K), and its quantiles are normal ones
+    where Student's are due: with 5 clusters plain percentiles hold the truth 86 times of 100, not 95. The level is
+    Φ(−t·√(K/(K − 1))), t the two-sided quantile of Student's distribution with K − 1 degrees of freedom.
+
+    Raises ValueError for `confidence` outside (0, 1), `clusters` < 1; with one cluster nothing varies, the plain level.
+
+    Source: T. C. Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69 (2015) 371–386
+    (expanded percentile interval).
+    """
+    from scipy.special import ndtr, stdtrit
+
+    tail = _tail(confidence)
+    if clusters < 1:
+        raise ValueError(f"expected at least one cluster, found {clusters}")
+    if clusters == 1:
+        return tail
+    return float(ndtr(stdtrit(clusters - 1, tail) * math.sqrt(clusters / (clusters - 1))))
 
 
 def _check_columns(first: NDArray[Any], second: NDArray[Any]) -> None:

@@ -11,9 +11,10 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from compare_folders import BRAKING, Row, row, write_folder
+from compare_folders import BRAKING, Row, row, widened, write_folder
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.compare import Comparison, compare
+from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 
 
 def compared(path: Path, rows: Sequence[Row], **given: Any) -> Comparison:
@@ -62,13 +63,15 @@ def test_the_horizon_that_was_given_cuts_all_times(tmp_path):
     assert of(comparison, "ttd_rmst_s")["difference"] == pytest.approx((0.25 + 0 + 0) / 3)
 
 
-def test_who_was_still_there_counts_as_long_as_he_was_looked_at(tmp_path):
+def test_who_was_still_there_is_censored(tmp_path):
+    """Looked at until 4 s: as the other, who is detected at 6 s, for all that is known of later times."""
     still = {"ended_by": "log_end", "ended_s": 4.0}
-    comparison = compared(tmp_path, [row("ideal", 1.0, 30.0, **still), row("late", None, **still)])
+    others = [row(name, 6.0, 30.0, object_id="8") for name in ("ideal", "late")]
+    comparison = compared(tmp_path, [row("ideal", 1.0, 30.0, **still), row("late", None, **still), *others])
     time = of(comparison, "ttd_rmst_s")
-    assert (time["value"], time["baseline_value"], time["difference"]) == (4.0, 1.0, 3.0)
-    away = compared(tmp_path / "away", [row("ideal", 1.0, 30.0, ended_s=4.0), row("late", None, ended_s=4.0)])
-    assert of(away, "ttd_rmst_s")["difference"] == 9.0
+    assert (time["value"], time["baseline_value"], time["difference"]) == (6.0, 3.5, 2.5)
+    away = [row("ideal", 1.0, 30.0, ended_s=4.0), row("late", None, ended_s=4.0), *others]
+    assert of(compared(tmp_path / "away", away), "ttd_rmst_s")["value"] == 8.0
 
 
 def test_times_count_from_the_onset(tmp_path):
@@ -140,7 +143,7 @@ def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]], seed: int =
     for resample in uniform:
         pairs = [pair for u in resample for pair in clusters[names[int(u * len(names))]]]
         means.append(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
-    low, high = np.quantile(means, [0.025, 0.975])
+    low, high = np.quantile(means, widened(len(names)))
     return float(low), float(high)
 
 
@@ -257,3 +260,50 @@ def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
     assert table["configuration"].drop_duplicates().tolist() == ["z", "b"]
     assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "dad_median_m"] * 6
     assert (table["baseline"] == "ideal").all()
+
+
+def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tmp_path):
+    """Each resample by itself: its rows, as often as they are drawn, through the estimator of one sample."""
+    rng = np.random.default_rng(12)
+    rows, sides = [], {"late": {}, "ideal": {}}
+    endings = {"log_end": CENSORED, "ego_left": CENSORED, "object_left": LEFT}
+    for k in range(6):
+        until, ended_by = float(rng.choice([3.0, 5.0, 7.0])), str(rng.choice(list(endings)))
+        for run in range(4):
+            for name in sides:
+                at = round(float(rng.uniform(0, 8)), 3)
+                known = at <= until
+                rows.append(
+                    row(name, at if known else None, 5.0 if known else None, object_id=str(k), run=run,
+                        ended_s=until, ended_by=ended_by)
+                )  # fmt: skip
+                sides[name].setdefault(f"a\n{k}", []).append((at, DETECTED) if known else (until, endings[ended_by]))
+    time = of(compared(tmp_path, rows, seed=SEED), "ttd_rmst_s")
+
+    def mean(name: str, drawn: Sequence[str]) -> float:
+        times = [pair for key in drawn for pair in sides[name][key]]
+        found = cumulative_incidence(np.array([t for t, _ in times]), np.array([e for _, e in times]))
+        return restricted_mean(*found, 10.0)
+
+    keys = sorted(sides["ideal"])
+    assert time["value"] == pytest.approx(mean("late", keys))
+    assert time["baseline_value"] == pytest.approx(mean("ideal", keys))
+    zeros = np.zeros(len(keys), dtype=np.int64)
+    address = Address(("",), zeros, object_words(keys), zeros)
+    uniform = Dice(SEED, "summary").uniform("bootstrap", address, np.arange(2000))
+    drawn = [[keys[int(u * len(keys))] for u in resample] for resample in uniform]
+    figures = [mean("late", some) - mean("ideal", some) for some in drawn]
+    assert (time["low"], time["high"]) == pytest.approx(tuple(np.quantile(figures, widened(6))), abs=1e-9)
+
+
+def test_all_metrics_of_a_pair_are_resampled_alike_or_not_at_all(tmp_path):
+    """Six logs, of which four have a distance: that is too few of them, not an occasion to resample objects."""
+    rows = [
+        row(name, time if k < 4 or name == "ideal" else None, 9.0 if k < 4 or name == "ideal" else None, log=f"log{k}")
+        for k in range(6)
+        for name, time in (("ideal", 1.0), ("late", 2.0))
+    ]
+    rows += [row(name, 1.0, None, log="log5", object_id="8") for name in ("ideal", "late")]
+    comparison = compared(tmp_path, rows)
+    assert of(comparison, "ttd_rmst_s")["interval_over"] == "logs"
+    assert set(comparison.table[comparison.table["log"] == "all"]["interval_over"].dropna()) == {"logs"}

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from compare_folders import Row, ghosts, row, seen, step, write_folder
+from compare_folders import Row, ghosts, row, seen, step, widened, write_folder
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.compare import Comparison, compare
 from copem_replay.compare import lists as lists_module
@@ -93,7 +93,7 @@ def test_errors_of_objects_are_resampled_whole(tmp_path):
         first, second = np.sqrt((both**2).mean(axis=1))
         means.append(first - second)
     assert error["interval_over"] == "objects"
-    assert (error["low"], error["high"]) == pytest.approx(tuple(np.quantile(means, [0.025, 0.975])), abs=1e-8)
+    assert (error["low"], error["high"]) == pytest.approx(tuple(np.quantile(means, widened(5))), abs=1e-8)
 
 
 # -------------------------------------------------------------------------------------------------- GOSPA
@@ -157,7 +157,7 @@ def test_resampled_objects_leave_the_number_of_lists_as_it_is(tmp_path):
     drawn = [[parts[key[2:]] for key in names] for names in resamples([f"a\n{key}" for key in parts])]
     figures = [math.sqrt(sum(a for a, _ in some)) - math.sqrt(sum(b for _, b in some)) for some in drawn]
     assert gospa["difference"] == pytest.approx(math.sqrt(10) - math.sqrt(5))
-    assert (gospa["low"], gospa["high"]) == pytest.approx(tuple(np.quantile(figures, [0.025, 0.975])), abs=1e-8)
+    assert (gospa["low"], gospa["high"]) == pytest.approx(tuple(np.quantile(figures, widened(5))), abs=1e-8)
 
 
 def test_lists_are_paired_part_by_part_as_well_as_at_once(tmp_path, monkeypatch):
@@ -200,7 +200,7 @@ def test_ghosts_go_with_the_object_that_is_nearest_and_the_others_stay(tmp_path)
     figures = [3 + sum(nearest[key[2:]] for key in drawn) for drawn in resamples([f"a\n{key}" for key in nearest])]
     assert rate["difference"] == 13.0
     assert rate["interval_over"] == "objects"
-    assert (rate["low"], rate["high"]) == pytest.approx(tuple(np.quantile(figures, [0.025, 0.975])))
+    assert (rate["low"], rate["high"]) == pytest.approx(tuple(np.quantile(figures, widened(5))))
 
 
 def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(tmp_path):
@@ -208,6 +208,9 @@ def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(t
     comparison = compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)])
     assert of(comparison, "ttd_rmst_s")["interval_over"] == "objects"
     assert pd.isna(of(comparison, "ghosts_per_min")["interval_over"])
+    assert [note for note in comparison.notes if note.startswith("no interval")] == [
+        "no interval of ghosts_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+    ]
 
 
 def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
@@ -218,7 +221,7 @@ def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
     rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
     figures = [np.mean([counts[int(run)] for run in drawn]) - 1 for drawn in resamples([str(k) for k in range(5)])]
     assert (rate["difference"], rate["interval_over"]) == (3.0, "runs")
-    assert (rate["low"], rate["high"]) == pytest.approx(tuple(np.quantile(figures, [0.025, 0.975])))
+    assert (rate["low"], rate["high"]) == pytest.approx(tuple(np.quantile(figures, widened(5))))
 
 
 # -------------------------------------------------------------------------------------- at equal ghosts
@@ -233,13 +236,29 @@ def at_equal_ghosts(path: Path, per_min: float | None, *, lists: Sequence[Row] =
 
 
 @pytest.mark.parametrize(
-    ("per_min", "existence", "time_s"), [(6, 0.0, 1.0), (5.9, 0.5, 3.0), (2, 0.5, 3.0), (0, 0.9, 10.0)]
+    ("per_min", "existence", "time_s", "kept"),
+    [
+        (6, 0.0, 1.0, 6),
+        (9, 0.0, 1.0, 6),  # there are no more
+        (5, 0.0, 0.75 * 1.0 + 0.25 * 3.0, 5),  # (5 − 2) / (6 − 2) of the drives with 6 a minute, the rest with 2
+        (2, 0.5, 3.0, 2),
+        (0.5, 0.5, 0.25 * 3.0 + 0.75 * 10.0, 0.5),
+        (0, 0.9, 10.0, 0),
+    ],
 )
-def test_times_are_at_the_lowest_threshold_with_so_few_ghosts(tmp_path, per_min, existence, time_s):
-    time = of(at_equal_ghosts(tmp_path, per_min), "ttd_rmst_s_equal_ghosts")
+def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_s, kept):
+    comparison = at_equal_ghosts(tmp_path, per_min)
+    time = of(comparison, "ttd_rmst_s_equal_ghosts")
     assert time["existence"] == existence
     assert time["baseline_existence"] == 0.0
+    assert (time["ghosts_kept_per_min"], time["baseline_ghosts_kept_per_min"]) == (kept, 0)
     assert (time["value"], time["baseline_value"], time["difference"]) == (time_s, 0.5, time_s - 0.5)
+    said = [note for note in comparison.notes if "ghosts per minute only" in note]
+    assert [note for note in said if note.startswith("late")] == (
+        ["late: all its entries make 6 ghosts per minute only: its ttd_rmst_s_equal_ghosts is at that"]
+        if kept < per_min
+        else []
+    )
 
 
 def test_the_rate_is_the_baselines_own_unless_given(tmp_path):
@@ -256,19 +275,16 @@ def test_an_entry_at_the_threshold_is_not_left_out(tmp_path):
     assert of(at_equal_ghosts(tmp_path, 2, lists=lists), "ttd_rmst_s_equal_ghosts")["value"] == 3.0
 
 
-def test_who_is_no_longer_detected_counts_as_in_any_other_mean(tmp_path):
+def test_who_is_no_longer_detected_is_censored_as_in_any_other_mean(tmp_path):
     still = {"ended_by": "log_end", "ended_s": 7.0}
-    assert of(at_equal_ghosts(tmp_path, 0, **still), "ttd_rmst_s_equal_ghosts")["value"] == 7.0
+    assert of(at_equal_ghosts(tmp_path, 0, **still), "ttd_rmst_s_equal_ghosts")["value"] == 10.0
 
 
-def test_more_ghosts_at_every_threshold_is_said(tmp_path):
+def test_where_no_threshold_is_clean_enough_nothing_is_listed_in_some_drives(tmp_path):
     lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.5], ghosts_at=[6, 2])]
-    comparison = at_equal_ghosts(tmp_path, 1, lists=lists)
-    time = of(comparison, "ttd_rmst_s_equal_ghosts")
-    assert pd.isna(time["difference"])
-    assert pd.isna(time["existence"])
-    assert time["baseline_value"] == 0.5
-    assert "late: more ghosts than that at every threshold: no ttd_rmst_s_equal_ghosts" in comparison.notes
+    time = of(at_equal_ghosts(tmp_path, 1, lists=lists), "ttd_rmst_s_equal_ghosts")
+    assert (time["existence"], time["ghosts_kept_per_min"]) == (0.5, 1)
+    assert time["value"] == 0.5 * 3.0 + 0.5 * 10.0  # half of the drives at 2 a minute, in half of them nothing
 
 
 def test_the_threshold_is_that_of_all_logs_in_each_of_them(tmp_path):
@@ -281,7 +297,9 @@ def test_the_threshold_is_that_of_all_logs_in_each_of_them(tmp_path):
     ]
     table = compared(tmp_path, rows, lists=lists, steps=steps).table
     times = table[table["metric"] == "ttd_rmst_s_equal_ghosts"]
-    assert times["existence"].tolist() == [0.5, 0.5, 0.5]  # 2 a minute of both logs: 4 of `a` and none of `b`
+    # 2 a minute of both logs: 4 of `a` and none of `b`, though one log alone has more and the other fewer.
+    assert times["existence"].tolist() == [0.5, 0.5, 0.5]
+    assert times["ghosts_kept_per_min"].tolist() == [2.0, 2.0, 2.0]
 
 
 def test_the_same_folder_again_differs_in_nothing(tmp_path):
@@ -301,3 +319,38 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     ]  # fmt: skip
     assert (comparison.table[["difference", "low", "high"]] == 0.0).all(axis=None)
     assert comparison.notes == ()
+
+
+def test_how_few_lists_both_have_is_said(tmp_path):
+    """Of four instants two are the other's; of the second log none."""
+    rows = [seen(name, FOUR, FOUR, log=log) for name in ("ideal", "late") for log in ("a", "b")]
+    folder = write_folder(tmp_path / "one", rows[::2], available_s={"late": [0.0, 0.5, 2.0, 2.5]})
+    assert compare([folder]).notes[-2:][0] == (
+        "late: position_rmse_m and gospa_m are over the 2 instants that both have, of 4 and the 4 of ideal"
+    )
+    folder = write_folder(tmp_path / "two", rows, available_s={"late": [0.25, 0.5, 0.75, 2.5]})
+    assert any(
+        note == "late: position_rmse_m and gospa_m are over the 0 instants that both have, of 8 and the 8 of ideal; "
+        "none in a, b"
+        for note in compare([folder]).notes
+    )
+    folder = write_folder(tmp_path / "same", rows)
+    assert not any("instants that both have" in note for note in compare([folder]).notes)
+
+
+@pytest.mark.parametrize(("always", "said"), [(False, 1), (True, 0)])
+def test_who_detects_by_truth_id_is_said(tmp_path, always, said):
+    rows = [row(name, 1.0, 30.0) for name in ("ideal", "GT", "gnn")]
+    path = write_folder(tmp_path / "study", rows, measure={"match": {"gate_m": 3.0, "always": always}})
+    fusions = "configurations: {GT: {units: truth}, ideal: {units: all}, gnn: {units: all, fusion: {kind: gnn}}}"
+    (path / "experiment.yaml").write_text(f"version: 1\n{fusions}\n")
+    notes = [note for note in compare([path]).notes if "by truth id" in note]
+    assert (
+        notes
+        == [
+            "ideal, GT: detected by truth id, the others by match within the gate (`match: {always: true}` matches all "
+            "alike)"
+        ]
+        * said
+    )
+    assert not [note for note in compare([path], configurations=["GT"]).notes if "by truth id" in note]

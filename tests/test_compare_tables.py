@@ -127,7 +127,7 @@ def test_the_table_has_signs_and_intervals(tmp_path):
     assert "±0 [0, 0]" in by_name["same"]
     assert "-0.25 [-0.25, -0.25]" in by_name["fast"]
     assert "+2.5 [2.5, 2.5]" in by_name["fast"]
-    assert "-0.5 [-0." in by_name["a|worse"]
+    assert "-0.5 [-1, 0]" in by_name["a|worse"]  # six are few: anything
     assert "+4.5 [" in by_name["a|worse"]
     assert by_name["a|worse"].endswith("–")  # half of them never: no median
     assert all("…" not in line and "..." not in line for line in lines)
@@ -138,7 +138,8 @@ def test_what_the_table_shows_is_said_below(tmp_path):
     assert lines == [
         "differences to ideal, paired by log, object and run; accuracy at instants that both have",
         "[95 %]: bootstrap interval over objects",
-        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that",
+        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that, who was still there at the "
+        "end as censored",
         "better than ideal in ttd_rmst_s, the interval excluding 0: fast",
         "better than ideal in dad_median_m, the interval excluding 0: fast",
     ]
@@ -160,7 +161,9 @@ def test_markdown_has_the_same_content(tmp_path):
     assert [c[0] for c in cells] == ["same", "fast", "a\0worse"]
     for line, of_row in zip(text[1:4], cells, strict=True):
         assert line.split() == " ".join(of_row).replace("\0", "|").split()
-    assert [line.removeprefix("- ") for line in markdown[6:]] == text[4:]
+    notes = [f"note: {note}" for note in comparison.notes]
+    assert len(notes) == 1
+    assert [line.removeprefix("- ") for line in markdown[6:]] == [*text[4:], *notes]
 
 
 def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
@@ -171,6 +174,7 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
     assert list(read[0]) == [
         "log", "configuration", "baseline", "metric", "value", "baseline_value", "difference", "low", "high",
         "interval_over", "n", "p_value", "only_configuration", "only_baseline", "existence", "baseline_existence",
+        "ghosts_kept_per_min", "baseline_ghosts_kept_per_min",
     ]  # fmt: skip
     assert [(r["log"], r["configuration"], r["metric"]) for r in read[3:6]] == [
         ("all", "fast", "detected_share"), ("all", "fast", "ttd_rmst_s"), ("all", "fast", "dad_median_m"),
@@ -193,6 +197,14 @@ def test_the_files_name_says_what_is_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
         write_comparison(comparison, tmp_path / "file" / "regret.csv")
+
+
+def test_results_are_not_overwritten_with_their_comparison(tmp_path):
+    folder = study(tmp_path, "a", "ideal", "GT")
+    with pytest.raises(OutputError, match=r"summary\.csv: expected another name, found that of a table of the results"):
+        check_out(folder / "summary.csv")
+    check_out(folder / "regret.csv")
+    check_out(tmp_path / "summary.csv")
 
 
 def test_rows_of_single_logs_are_in_the_csv_only(tmp_path):

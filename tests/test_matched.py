@@ -150,9 +150,7 @@ def of_two_units(lists: Sequence[Sequence[Item]], issue_s: Sequence[float], capt
 def test_a_blind_unit_confirms_nothing_and_takes_nothing_away() -> None:
     """A mast lists every 0.8 s, a blind ego every 0.1 s: the mast's own two of three, and not before."""
     ego_s, mast_s = np.arange(20) / 10, np.array([0.0, 0.8, 1.6])
-    captures = Captures(
-        np.append(ego_s, mast_s), np.repeat([0, 1], [20, 3]), np.append(np.arange(20), [0, 8, 16])
-    )
+    captures = Captures(np.append(ego_s, mast_s), np.repeat([0, 1], [20, 3]), np.append(np.arange(20), [0, 8, 16]))
     lists = [[Item(7, mast_s[np.searchsorted(mast_s, t + 1e-9) - 1], unit_ix=1)] for t in ego_s]
     assert of_two_units(lists, ego_s.tolist(), captures) == 0.8
 

@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from compare_folders import widened
 from copem_replay.statistics import (
     CENSORED,
     DETECTED,
     LEFT,
     bootstrap_share,
     cumulative_incidence,
+    expanded_tail,
     quantile_time,
     quantile_with_never,
     restricted_mean,
@@ -393,8 +395,33 @@ def every_resample(clusters: int) -> Array:
 def test_four_resamples_by_hand():
     # Clusters 0 of 2 and 4 of 4. Drawn: both first, first and second twice, both second.
     uniform = np.array([[0.1, 0.2], [0.1, 0.9], [0.6, 0.4], [0.99, 0.5]])
-    # Shares 0, 2/3, 2/3, 1; of these the quantiles 1/4 and 3/4 lie at 0.75 and 2.25 steps.
-    assert share([0, 4], [2, 4], uniform, 0.5) == pytest.approx((0.5, 0.75), abs=1e-15)
+    # Shares 0, 2/3, 2/3, 1. Two clusters: Student's quantile of one degree of freedom is 1, by √2: Φ(−√2) = 0.0786496.
+    steps = 3 * 0.07864960352514258
+    expected = (2 / 3 * steps, 1 - 1 / 3 * steps)
+    assert share([0, 4], [2, 4], uniform, 0.5) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(("clusters", "tail"), [(1, 0.025), (2, 0.0), (5, 0.00095), (10, 0.00855), (10**6, 0.025)])
+def test_few_clusters_widen_the_tails(clusters, tail):
+    assert expanded_tail(0.95, clusters) == pytest.approx(tail, abs=5e-6)
+
+
+def test_no_cluster_has_no_tail():
+    with pytest.raises(ValueError, match="cluster"):
+        expanded_tail(0.95, 0)
+
+
+@pytest.mark.long
+def test_intervals_over_few_clusters_hold_the_mean_as_often_as_they_say():
+    """Means of 5 clusters of equal size: plain percentiles hold it 85 times of 100; these at least 91."""
+    dice = np.random.default_rng(11)
+    held = 0
+    for _ in range(400):
+        shares = dice.beta(4, 4, 5)
+        successes, totals = np.rint(shares * 10_000).astype(int), np.full(5, 10_000)
+        low, high = bootstrap_share(successes, totals, uniform=dice.uniform(1e-9, 1, (1000, 5)), resamples=1000)
+        held += low <= 0.5 <= high
+    assert held >= 0.91 * 400
 
 
 def test_resamples_without_any_total_are_left_out():
@@ -432,9 +459,10 @@ def sorted_shares(clusters: list[tuple[int, int]]) -> list[Fraction]:
 def test_over_every_resample_the_limits_are_its_ordered_shares(clusters: list[tuple[int, int]], tail: int):
     shares = sorted_shares(clusters)
     successes, totals = (list(column) for column in zip(*clusters, strict=True))
-    # `tail` fortieths on each side; between two ordered shares, straight.
+    # `tail` fortieths on each side, widened; between two ordered shares, straight.
+    low, high = widened(len(clusters), 1 - tail / 20) if len(clusters) > 1 else (tail / 40, 1 - tail / 40)
     expected = []
-    for level in (Fraction(tail, 40), 1 - Fraction(tail, 40)):
+    for level in (Fraction(low), Fraction(high)):
         steps = level * (len(shares) - 1)
         below = math.floor(steps)
         above = min(below + 1, len(shares) - 1)

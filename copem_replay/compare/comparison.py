@@ -13,9 +13,15 @@ import pandas as pd
 from copem_replay.compare.comparable import check_comparable
 from copem_replay.compare.folders import Folder, read_folders
 from copem_replay.compare.grid import Grid, grid_of
-from copem_replay.compare.intervals import Draws, clusters
+from copem_replay.compare.intervals import Draws, Whose, clusters, resampled_over
 from copem_replay.compare.names import Named, chosen, named
-from copem_replay.compare.notes import notes_on_folders, notes_on_pairs, notes_on_rows
+from copem_replay.compare.notes import (
+    note_on_measuring,
+    notes_on_folders,
+    notes_on_instants,
+    notes_on_pairs,
+    notes_on_rows,
+)
 from copem_replay.compare.regret import Regret, Setting, own_rate, regrets
 from copem_replay.compare.sides import Side, side_of
 from copem_replay.errors import InputError
@@ -43,6 +49,8 @@ COLUMNS = {
     "only_baseline": "Int64",
     "existence": "float64",
     "baseline_existence": "float64",
+    "ghosts_kept_per_min": "float64",
+    "baseline_ghosts_kept_per_min": "float64",
 }
 """Columns of a comparison, and as what pandas has them."""
 
@@ -91,14 +99,16 @@ def compare(
     setting = _setting(read, second, ghosts_per_min)
     draws = Draws(read[0].seed)
     rows: list[dict[str, object]] = []
-    there = {}
+    sides: list[Side] = []
     for one in others:
         first = side_of(one, grid)
         _check_same_looks(one, first, against, second, grid)
-        there[one.label] = first.there
+        sides.append(first)
+        cells = np.flatnonzero(first.there & second.there)
+        pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
         for regret in regrets(first, second, grid, setting):
             names = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
-            rows += (row | names for row in _rows(regret, grid, draws))
+            rows += (row | names for row in _rows(regret, pair, grid, draws))
     # All logs first, then log by log; configurations and metrics stay in their order.
     rows = [row for log in (ALL_LOGS, *range(len(grid.logs))) for row in rows if row["log_ix"] == log]
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
@@ -108,7 +118,13 @@ def compare(
         configurations=tuple(one.label for one in others),
         horizon_s=setting.horizon_s,
         ghosts_per_min=setting.ghosts_per_min,
-        notes=(*notes_on_folders(used), *notes_on_pairs(against.label, second.there, there), *notes_on_rows(table)),
+        notes=(
+            *notes_on_folders(used),
+            *notes_on_pairs(against.label, second.there, {side.label: side.there for side in sides}),
+            *note_on_measuring(against, others),
+            *notes_on_instants(second, sides, grid.logs),
+            *notes_on_rows(table, setting.ghosts_per_min),
+        ),
     )
 
 
@@ -140,29 +156,30 @@ def _check_same_looks(one: Named, first: Side, against: Named, second: Side, gri
             )
 
 
-def _rows(regret: Regret, grid: Grid, draws: Draws) -> Iterator[dict[str, object]]:
-    """A row of all logs, then, where there are several, one for each."""
-    yield _row(regret, grid, draws) | {"log": ALL, "log_ix": ALL_LOGS}
+def _rows(regret: Regret, pair: Whose, grid: Grid, draws: Draws) -> Iterator[dict[str, object]]:
+    """A row of all logs, then, where there are several, one for each. `pair`: all rows that both sides have."""
+    yield _row(regret, pair, grid, draws) | {"log": ALL, "log_ix": ALL_LOGS}
     for k, name in enumerate(grid.logs if len(grid.logs) > 1 else ()):
         of_log = replace(regret, figure=regret.figure.take(regret.figure.whose.log_ix == k))
-        yield _row(of_log, grid, draws) | {"log": name, "log_ix": k}
+        yield _row(of_log, pair.take(pair.log_ix == k), grid, draws) | {"log": name, "log_ix": k}
 
 
-def _row(regret: Regret, grid: Grid, draws: Draws) -> dict[str, object]:
+def _row(regret: Regret, pair: Whose, grid: Grid, draws: Draws) -> dict[str, object]:
     figure = regret.figure
     value, other, difference = figure.values()
     row: dict[str, object] = {"value": _number(value), "baseline_value": _number(other), "n": int(figure.n.sum())}
     row["difference"] = _number(difference)
-    drawn = clusters(figure.whose, grid)
+    drawn = clusters(figure.whose, resampled_over(pair), grid)
     if drawn is not None and math.isfinite(difference) and (figure.by_object or drawn.over != "objects"):
-        low, high = percentile_limits(figure.resampled(drawn, draws.counts(drawn.names)))
+        low, high = percentile_limits(figure.resampled(drawn, draws.counts(drawn.names)), clusters=len(drawn.names))
         row |= {"low": _number(low), "high": _number(high), "interval_over": drawn.over}
     if figure.only is not None:
         only = figure.only.sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
         row["p_value"] = mcnemar(int(only[0]), int(only[1])) if len(figure.only) else None
-    if regret.existence is not None:
-        row |= dict(zip(("existence", "baseline_existence"), map(_number, regret.existence), strict=True))
+    if regret.kept is not None:
+        for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
+            row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.ghosts_per_min
     return row
 
 

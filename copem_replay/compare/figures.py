@@ -12,7 +12,7 @@ import numpy as np
 
 from copem_replay.compare.intervals import Clusters, Counts, Whose
 from copem_replay.paired import resampled_medians, resampled_sums
-from copem_replay.statistics import quantile_with_never
+from copem_replay.statistics import CENSORED, DETECTED, cumulative_incidence, quantile_with_never, restricted_mean
 from copem_replay.tracks import Bool, Float, Int
 
 
@@ -96,6 +96,83 @@ class OfMedians(Figure):
     def resampled(self, clusters: Clusters, count: Counts) -> Float:
         """(R,) medians of the differences."""
         return resampled_medians(self.differences, clusters.of, count)
+
+
+@dataclass(frozen=True)
+class Times:
+    """Times (i,) and how each ended, as `statistics.cumulative_incidence` has them, in a share of the drives."""
+
+    share: float
+    time_s: Float
+    ending: Int
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfTimes(Figure):
+    """Restricted means of times to detection; those of a side are the mean of its parts, by their shares."""
+
+    first: tuple[Times, ...]
+    second: tuple[Times, ...]
+    horizon_s: float
+
+    def take(self, kept: Bool) -> Self:
+        """The same figure of some items."""
+        first, second = (
+            tuple(Times(part.share, part.time_s[kept], part.ending[kept]) for part in side)
+            for side in (self.first, self.second)
+        )
+        return replace(super().take(kept), first=first, second=second)
+
+    def values(self) -> tuple[float, float, float]:
+        """Of the first, of the second, and their difference."""
+        if not len(self.n):
+            return math.nan, math.nan, math.nan
+        first, second = (
+            sum(
+                part.share * restricted_mean(*cumulative_incidence(part.time_s, part.ending), self.horizon_s)
+                for part in side
+            )
+            for side in (self.first, self.second)
+        )
+        return first, second, first - second
+
+    def resampled(self, clusters: Clusters, count: Counts) -> Float:
+        """(R,) differences."""
+        first, second = (
+            sum((part.share * self._means(part, clusters, count) for part in side), np.zeros(len(count)))
+            for side in (self.first, self.second)
+        )
+        difference: Float = first - second
+        return difference
+
+    def _means(self, part: Times, clusters: Clusters, count: Counts) -> Float:
+        """(R,) restricted means: `cumulative_incidence` for all resamples at once.
+
+        Its steps weigh by what the censored before them hand on. Times at which somebody is censored are few, those of
+        objects: between two of them sums over clusters are enough.
+        """
+        censored = part.ending == CENSORED
+        lost_s = np.unique(part.time_s[censored])
+        K, spans = len(clusters.names), len(lost_s) + 1
+        span = np.searchsorted(lost_s, part.time_s, side="left")  # censored at the end of it, or all else within it
+
+        def by_cluster(kept: Bool, weight: Float) -> Float:
+            """(R, spans) sums of the resamples."""
+            place = clusters.of[kept] * spans + span[kept]
+            return count.astype(float) @ np.bincount(place, weight[kept], minlength=K * spans).reshape(K, spans)
+
+        ones = np.ones(len(part.time_s))
+        within = by_cluster(np.ones(len(ones), dtype=bool), ones)
+        total = within.sum(axis=1)
+        lost = by_cluster(censored, ones)[:, :-1]
+        remaining = total[:, None] - np.cumsum(within, axis=1)[:, :-1]
+        there = remaining > 0  # whole numbers
+        factors = np.where(there, 1.0 + lost / np.where(there, remaining, 1.0), 1.0)
+        handed = np.concatenate([np.ones((len(count), 1)), np.cumprod(factors, axis=1)], axis=1)
+        gained = by_cluster(part.ending == DETECTED, np.maximum(self.horizon_s - part.time_s, 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            means: Float = self.horizon_s - (gained * handed).sum(axis=1) / total
+        return means
 
 
 def _median(values: Float) -> float:

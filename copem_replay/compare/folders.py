@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,6 +70,7 @@ class Folder:
     measure: dict[str, Any]
     braking: dict[str, Any] | None
     ego: object
+    by_truth_id: frozenset[str]  # configurations that detect by truth id: the truth, and ideal fusion
     horizon_used_s: float | None
     tables: dict[str, pa.Table]
 
@@ -101,7 +102,10 @@ def read_folder(path: Path) -> Folder:
     columns = _DETECTIONS | (_BRAKING if fields["braking"] is not None else {})
     tables = {"detections.parquet": _table(path / "detections.parquet", columns)}
     tables |= {name: _table(path / name, of) for name, of in OPTIONAL.items() if (path / name).is_file()}
-    return Folder(path=path, ego=_ego(path / "experiment.yaml"), tables=tables, **fields)
+    experiment = _experiment(path / "experiment.yaml")
+    always = bool(fields["measure"]["match"].get("always"))
+    by_id = frozenset() if always else frozenset(_by_truth_id(experiment.get("configurations")))
+    return Folder(path=path, ego=experiment.get("ego"), by_truth_id=by_id, tables=tables, **fields)
 
 
 def _provenance(path: Path) -> dict[str, Any]:
@@ -127,13 +131,21 @@ def _provenance(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {_AGAIN}") from None
 
 
-def _ego(path: Path) -> object:
-    """Whom the experiment names as its ego. Raises InputError."""
+def _by_truth_id(configurations: object) -> Iterator[str]:
+    """Configurations that need no match with the truth to know an object."""
+    for name, said in configurations.items() if isinstance(configurations, dict) else ():
+        fusion = said.get("fusion") if isinstance(said, dict) else None
+        if isinstance(said, dict) and (fusion is None or fusion.get("kind", "ideal") == "ideal"):
+            yield str(name)
+
+
+def _experiment(path: Path) -> dict[str, Any]:
+    """The experiment as plain data. Raises InputError."""
     try:
         data, _, _ = read(path.read_text(encoding="utf-8"))
         if not isinstance(data, dict):
             raise TypeError("no keys and values")
-        return data.get("ego")
+        return data
     except (OSError, ValueError, TypeError, NotYamlError) as error:
         why = " ".join(str(error).split())
         raise InputError(f"{path}: expected the experiment of the results, found damage: {why}; {_AGAIN}") from None

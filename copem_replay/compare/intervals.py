@@ -65,15 +65,22 @@ class Clusters:
     of: Int
 
 
-def clusters(whose: Whose, grid: Grid) -> Clusters | None:
-    """What is resampled; None: too little of anything."""
-    things, logs = np.unique(whose.object_ix[whose.object_ix >= 0]), np.unique(whose.log_ix)
+def resampled_over(rows: Whose) -> str:
+    """What is resampled of a pair, going by all rows that both have: the same for all its metrics."""
+    things, logs = np.unique(rows.object_ix), np.unique(rows.log_ix)
     if len(things) == 1 and len(logs) == 1:
-        found = _named("runs", whose.run, [str(run) for run in range(grid.runs)])
-    elif len(logs) >= FEWEST_CLUSTERS:
-        found = _named("logs", whose.log_ix, grid.logs)
+        return "runs"
+    return "logs" if len(logs) >= FEWEST_CLUSTERS else "objects"
+
+
+def clusters(whose: Whose, over: str, grid: Grid) -> Clusters | None:
+    """The logs, objects or runs of items that are resampled; None: too few of them have the figure."""
+    if over == "runs":
+        found = _named(over, whose.run, [str(run) for run in range(grid.runs)])
+    elif over == "logs":
+        found = _named(over, whose.log_ix, grid.logs)
     else:
-        found = _named("objects", whose.object_ix, grid.objects)
+        found = _named(over, whose.object_ix, grid.objects)
     return found if len(found.names) >= FEWEST_CLUSTERS else None
 
 

@@ -54,6 +54,12 @@ def together(first: Accuracy, second: Accuracy, grid: Grid, cells: Int) -> Toget
     return Together(matched, squared, measured, gospa, seen.reshape(places, most).sum(axis=1))
 
 
+def shared_instants(first: Accuracy, second: Accuracy) -> Int:
+    """(L,) how many instants of each log both have."""
+    other, offset = _same_instants(first, second)
+    return np.array([int((part >= 0).sum()) for part in np.split(other, offset[1:])], dtype=np.int64)
+
+
 def _same_instants(first: Accuracy, second: Accuracy) -> tuple[Int, Int]:
     """For each instant of the first, log by log, its number in the second, −1: none; and where each log begins (L,)."""
     found = []

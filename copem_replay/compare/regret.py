@@ -3,13 +3,15 @@
 Rows are paired by log, object and run, lists by instant; differences are first − second. Definitions are those of
 `summary.csv`, but for what pairs allow:
 
-*ttd_rmst_s*: the mean of min(T, horizon). Never detected counts as the horizon; who was still there when we stopped
-looking as the time looked, at most the horizon, in both alike.
+*ttd_rmst_s*: the difference of the two restricted means over the rows that both have; never detected counts as the
+horizon, who was still there when we stopped looking is censored.
 *dad_median_m*: the median of the differences, not the difference of the medians. Never detected is below every
 distance, so it differs infinitely from a distance, and not at all from never.
 *gospa_m*: a list counts where an object is measured in it, on or after its onset.
-*ttd_rmst_s_equal_ghosts*: ttd_rmst_s, with entries below a threshold of existence left out: of each side the lowest
-with at most so many ghosts per minute, over all logs and runs. Resamples keep the threshold.
+*ttd_rmst_s_equal_ghosts*: ttd_rmst_s, with entries below a threshold of existence left out, so that each side has as
+many ghosts per minute over all logs and runs as is asked for. Between two thresholds (the second may leave nothing)
+it is their mixture that has exactly as many: a share of the drives goes by the one, the rest by the other, as between
+two points of a ROC curve. Resamples keep the thresholds and the share.
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.compare.figures import Figure, OfMedians, OfSums
+from copem_replay.compare.figures import Figure, OfMedians, OfSums, OfTimes, Times
 from copem_replay.compare.grid import Grid
 from copem_replay.compare.intervals import Whose
 from copem_replay.compare.lists import together
-from copem_replay.compare.sides import Ghosts, Side
+from copem_replay.compare.sides import Ghosts, Side, Steps
+from copem_replay.statistics import CENSORED, DETECTED, LEFT
 from copem_replay.tracks import Bool, Float, Int
 
 METRICS = {
@@ -49,20 +52,30 @@ class Setting:
 
 
 @dataclass(frozen=True)
+class Kept:
+    """Entries of at least `existence` are listed in a share of the drives, in the rest those of at least `above`."""
+
+    existence: float
+    above: float  # inf: nothing
+    share: float
+    ghosts_per_min: float
+
+
+@dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `existence`: the thresholds of the first and of the second, where there are such."""
+    """A metric of a pair; `kept`: at which ghosts the first and the second are, where that is chosen."""
 
     metric: str
     figure: Figure
-    existence: tuple[float, float] | None = None
+    kept: tuple[Kept, Kept] | None = None
 
 
 def regrets(first: Side, second: Side, grid: Grid, setting: Setting) -> Iterator[Regret]:
     """Every metric that both sides have what it takes for."""
     cells = np.flatnonzero(first.there & second.there)
     yield Regret("detected_share", _shares(grid, cells, first.detected[cells], second.detected[cells]))
-    times = [_times_s(side, side.detection_s, cells, setting.horizon_s) for side in (first, second)]
-    yield Regret("ttd_rmst_s", _means(grid, cells, times[0], times[1]))
+    times = [(_times(side, side.detection_s, cells),) for side in (first, second)]
+    yield Regret("ttd_rmst_s", _restricted_means(grid, cells, times[0], times[1], setting))
     yield from _at_equal_ghosts(first, second, grid, cells, setting)
     yield Regret("dad_median_m", _distances(first, second, grid, cells))
     yield from _of_lists(first, second, grid, cells, setting.power)
@@ -107,19 +120,38 @@ def _shares(grid: Grid, cells: Int, first: Bool, second: Bool) -> OfSums:
     return _means(grid, cells, first.astype(float), second.astype(float), only)
 
 
-def _times_s(side: Side, detection_s: Float, cells: Int, horizon_s: float) -> Float:
-    """(C,) min(T, horizon) of cells, detected at `detection_s (N·S,)` or, NaN, not. To a nanosecond, as in summary."""
-    onset_s = side.onset_s[cells]
-    looked_s = np.where(side.left[cells], np.inf, side.ended_s[cells] - onset_s)
-    time_s = np.where(np.isnan(detection_s[cells]), looked_s, detection_s[cells] - onset_s)
-    return np.minimum(np.round(time_s, 9), horizon_s)
+def _times(side: Side, detection_s: Float, cells: Int, share: float = 1.0) -> Times:
+    """Times of cells (C,), detected at `detection_s (N·S,)` or, NaN, not. To a nanosecond, as in summary."""
+    onset_s, detected = side.onset_s[cells], ~np.isnan(detection_s[cells])
+    time_s = np.where(detected, detection_s[cells], side.ended_s[cells]) - onset_s
+    ending = np.where(detected, DETECTED, np.where(side.left[cells], LEFT, CENSORED))
+    return Times(share, np.round(time_s, 9), ending)
 
 
-def threshold(ghosts: Ghosts, per_min: float) -> float | None:
-    """The lowest existence with at most so many ghosts per minute; None: even the highest has more."""
-    minutes, counts = ghosts.minutes[ghosts.there].sum(), ghosts.at[ghosts.there].sum(axis=0)
-    enough = counts <= per_min * minutes * (1 + 1e-9)
-    return float(ghosts.existence[np.argmax(enough)]) if enough.any() and minutes > 0 else None
+def _restricted_means(
+    grid: Grid, cells: Int, first: tuple[Times, ...], second: tuple[Times, ...], setting: Setting
+) -> OfTimes:
+    return OfTimes(
+        whose=_whose(grid, cells),
+        n=np.ones(len(cells), dtype=np.int64),
+        first=first,
+        second=second,
+        horizon_s=setting.horizon_s,
+    )
+
+
+def kept_at(ghosts: Ghosts, per_min: float) -> Kept | None:
+    """What is listed with so many ghosts per minute, or with fewer where all have fewer; None: there is no minute."""
+    minutes = float(ghosts.minutes[ghosts.there].sum())
+    if minutes <= 0 or not len(ghosts.existence):
+        return None
+    rates = np.append(ghosts.at[ghosts.there].sum(axis=0) / minutes, 0.0)
+    limits = np.append(ghosts.existence, np.inf)
+    k = int(np.argmax(rates <= per_min * (1 + 1e-9)))
+    if k == 0 or rates[k] >= per_min * (1 - 1e-9):
+        return Kept(float(limits[k]), float(limits[k]), 1.0, float(rates[k]))
+    share = float((per_min - rates[k]) / (rates[k - 1] - rates[k]))
+    return Kept(float(limits[k - 1]), float(limits[k]), share, per_min)
 
 
 def own_rate(ghosts: Ghosts) -> float | None:
@@ -129,20 +161,31 @@ def own_rate(ghosts: Ghosts) -> float | None:
 
 
 def _at_equal_ghosts(first: Side, second: Side, grid: Grid, cells: Int, setting: Setting) -> Iterator[Regret]:
-    limits, times = [], []
+    kept, times = [], []
     for side in (first, second):
         if side.ghosts is None or side.steps is None or setting.ghosts_per_min is None:
             return
-        limit = threshold(side.ghosts, setting.ghosts_per_min)
-        detection_s = np.full(len(grid.object_of), np.inf)
-        if limit is not None:
-            kept = side.steps.existence >= limit
-            np.minimum.at(detection_s, side.steps.cell[kept], side.steps.detection_s[kept])
-        limits.append(np.nan if limit is None else limit)
-        detection_s[np.isinf(detection_s)] = np.nan
-        times.append(_times_s(side, detection_s, cells, setting.horizon_s))
-    times = [np.where(np.isnan(limit), np.nan, time_s) for limit, time_s in zip(limits, times, strict=True)]
-    yield Regret("ttd_rmst_s_equal_ghosts", _means(grid, cells, times[0], times[1]), (limits[0], limits[1]))
+        found = kept_at(side.ghosts, setting.ghosts_per_min)
+        if found is None:
+            return
+        kept.append(found)
+        parts = ((found.share, found.existence), (1.0 - found.share, found.above))
+        size = len(grid.object_of)
+        times.append(
+            tuple(
+                _times(side, _detected_s(side.steps, limit, size), cells, share) for share, limit in parts if share > 0
+            )
+        )
+    figure = _restricted_means(grid, cells, times[0], times[1], setting)
+    yield Regret("ttd_rmst_s_equal_ghosts", figure, (kept[0], kept[1]))
+
+
+def _detected_s(steps: Steps, existence: float, cells: int) -> Float:
+    """(C,) when each cell is detected by entries of at least some existence; NaN: never."""
+    detection_s = np.full(cells, np.inf)
+    enough = steps.existence >= existence
+    np.minimum.at(detection_s, steps.cell[enough], steps.detection_s[enough])
+    return np.where(np.isinf(detection_s), np.nan, detection_s)
 
 
 def _distances(first: Side, second: Side, grid: Grid, cells: Int) -> OfMedians:

@@ -15,6 +15,7 @@ from copem_replay.errors import OutputError
 from copem_replay.table import as_text
 
 _SUFFIXES = (".csv", ".md")
+_RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
 _NOTHING = 1e-9
 """Closer to 0 than this is 0 (chosen: below what any of the metrics is measured with)."""
 
@@ -25,17 +26,20 @@ def comparison_text(comparison: Comparison) -> str:
 
 
 def comparison_markdown(comparison: Comparison) -> str:
-    """The same as a Markdown table, the lines after it as a list; ends with a newline."""
+    """The same as a Markdown table, the lines after it and the notes as a list; ends with a newline."""
     cells = _cells(comparison)
+    notes = (f"note: {note}" for note in comparison.notes)
     rows = [list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)]
     lines = ["| " + " | ".join(_escaped(str(cell)) for cell in row) + " |" for row in rows]
-    return "\n".join([*lines, "", *(f"- {_escaped(line)}" for line in _lines(comparison)), ""])
+    return "\n".join([*lines, "", *(f"- {_escaped(line)}" for line in (*_lines(comparison), *notes)), ""])
 
 
 def check_out(path: Path) -> None:
     """Raise OutputError where a comparison cannot be written as what the file's name says."""
     if path.suffix.lower() not in _SUFFIXES:
         raise OutputError(f"{path}: expected a name that ends with {' or '.join(_SUFFIXES)}, found {path.name}")
+    if path.name in _RESULTS and (path.parent / "provenance.json").exists():
+        raise OutputError(f"{path}: expected another name, found that of a table of the results in that folder")
 
 
 def write_comparison(comparison: Comparison, path: Path) -> None:
@@ -86,11 +90,14 @@ def _lines(comparison: Comparison) -> Iterator[str]:
     kinds = [kind if len(over) == 1 else f"{kind} ({', '.join(metrics)})" for kind, metrics in over.items()]
     if kinds:
         yield f"[95 %]: bootstrap interval over {'; '.join(kinds)}"
-    yield f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that"
+    yield (
+        f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that, who "
+        "was still there at the end as censored"
+    )
     if "ttd_rmst_s_equal_ghosts" in shown:
         yield (
-            "ttd_rmst_s_equal_ghosts: the same, of each with entries below an existence left out, the lowest with at "
-            f"most {comparison.ghosts_per_min:.4g} ghosts per minute"
+            "ttd_rmst_s_equal_ghosts: the same, of each with so many of its least certain entries left out that "
+            f"{comparison.ghosts_per_min:.4g} ghosts per minute remain"
         )
     for metric, better in METRICS.items():
         of = overall[overall["metric"] == metric]
