@@ -19,7 +19,7 @@ from copem_replay.wording import counted
 
 _ROLES = {
     "truth": "the truth",
-    "unit": "lists of a recorded unit, not the truth",
+    "unit": "lists of a unit, for `recorded: {topic: …}`",
     "unread": "not read by this version",
 }
 _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"

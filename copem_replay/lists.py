@@ -20,6 +20,9 @@ from copem_replay.formats import detail, osi, sensor_data
 from copem_replay.resample import wrap
 from copem_replay.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 
+_LARGEST_ID = 2**63 - 1
+"""OSI's identifiers are unsigned: what is beyond the signed ones is brought among them."""
+
 
 @dataclass
 class _Rows:
@@ -28,7 +31,7 @@ class _Rows:
     stamps: list[tuple[int, int]] = field(default_factory=list)  # captured, arrives
     frame: list[int] = field(default_factory=list)
     ident: list[int] = field(default_factory=list)  # ground truth id, −1: none
-    track: list[int] = field(default_factory=list)
+    track: list[int] = field(default_factory=list)  # −1: none
     values: list[tuple[float, ...]] = field(default_factory=list)
     variances: list[tuple[float, ...]] = field(default_factory=list)
     existence: list[float] = field(default_factory=list)  # NaN: not said
@@ -95,8 +98,7 @@ def read_recorded(path: Path, topic: str, scene: Scene) -> RecordedLists:
         tracks,
         np.array(rows.existence, dtype=float)[order],
         probability / probability.sum(axis=1, keepdims=True),
-        # OSI's identifiers are unsigned: what is beyond the signed ones is brought among them.
-        np.array(rows.track, dtype=np.uint64)[order].astype(np.int64),
+        np.array(rows.track, dtype=np.int64)[order],
         np.array(rows.spread_said, dtype=bool)[order],
         np.array(rows.capture_said, dtype=bool)[by_time],
         int((~placed).sum()),
@@ -147,15 +149,25 @@ def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
         rows.frame.append(frame)
         truth = item.header.ground_truth_id
         rows.ident.append(truth[0].value if truth else -1)
-        rows.track.append(item.header.tracking_id.value)
+        tracked = item.header.HasField("tracking_id")
+        rows.track.append(item.header.tracking_id.value & _LARGEST_ID if tracked else -1)
         vx, vy = (speed.x, speed.y) if speed is not None else (0.0, 0.0)
         x, y, z, yaw, vx, vy = _in_world(message, place.x, place.y, place.z, base.orientation.yaw, vx, vy)
         if not base.HasField("position"):  # nowhere is not the origin
             x = y = np.nan
         rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
         fast = spread.velocity.x if speed is not None else 0.0
-        sigma = (spread.position.x, 0.0, spread.position.y, spread.orientation.yaw, spread.dimension.length, fast)
-        rows.variances.append(tuple(s * s for s in sigma))
+        beside = (spread.orientation.yaw, spread.dimension.length, fast)
+        along, across, turn = spread.position.x**2, spread.position.y**2, _turn(message)
+        cos, sin = np.cos(turn), np.sin(turn)
+        rows.variances.append(
+            (
+                float(cos * cos * along + sin * sin * across),
+                float(cos * sin * (along - across)),
+                float(sin * sin * along + cos * cos * across),
+                *(s * s for s in beside),
+            )
+        )
         header = item.header
         said = header.HasField("existence_probability")
         rows.existence.append(header.existence_probability if said else np.nan)
@@ -174,6 +186,13 @@ def _likely(item: Any) -> dict[int, float]:
         share = candidate.probability if candidate.HasField("probability") else 1.0
         likely[kind] = likely.get(kind, 0.0) + max(share, 0.0)
     return likely
+
+
+def _turn(message: Any) -> float:
+    """By how much the frame of the entries is turned against the world."""
+    if not message.HasField("host_vehicle_location"):
+        return 0.0
+    return float(message.mounting_position.orientation.yaw + message.host_vehicle_location.orientation.yaw)
 
 
 def _in_world(
@@ -201,7 +220,7 @@ def _tracks(rows: _Rows, details: dict[int, dict[str, Any]], topic: str, scene: 
     frame = place[np.array(rows.frame, dtype=np.int64)]
     known = {sensor_data.osi_id(name): k for k, name in enumerate(scene.object_ids)}
     object_ix = np.array([known.get(i, -1) for i in rows.ident], dtype=np.int64)
-    track = np.array(rows.track, dtype=np.uint64)
+    track = np.array(rows.track, dtype=np.int64)
     order = np.lexsort((frame, track, object_ix))
     new = np.ones(len(order), dtype=bool)
     new[1:] = (np.diff(object_ix[order]) != 0) | (np.diff(track[order]) != 0)

@@ -19,11 +19,13 @@ from copem_replay.experiment import Recorded
 from copem_replay.fusion.agree import AGREE
 from copem_replay.lists import RecordedLists, read_recorded
 from copem_replay.resample import at_instants
-from copem_replay.tracks import SAME_INSTANT_NS, Float, Int, Scene, Tracks, joined
+from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.wording import counted
 
 MOVING_MPS = 2.0
 """A track moves that is faster than this, and its unit says so (chosen: jitter of a place is not)."""
+OWN_BODY_M = 0.5
+"""So far beside the ego's box the centre of its own body is listed (chosen: nobody else's can be that near)."""
 MOSTLY = 0.8
 """More than this share of entries is no chance (chosen)."""
 
@@ -85,7 +87,8 @@ def recorded_unit(path: Path, scene: Scene, name: str, asked: Recorded) -> tuple
 def _backwards(found: RecordedLists) -> float | None:
     """Of the entries of moving tracks the share whose velocity points against their way; None: nothing moves."""
     tracks = found.tracks
-    order = np.lexsort((tracks.row_captured_s, found.track_id))
+    named = np.flatnonzero(found.track_id >= 0)
+    order = named[np.lexsort((tracks.row_captured_s[named], found.track_id[named]))]
     same = (np.diff(found.track_id[order]) == 0) & (np.diff(tracks.row_captured_s[order]) > 0)
     before, after = order[:-1][same], order[1:][same]
     step_s = tracks.row_captured_s[after] - tracks.row_captured_s[before]
@@ -98,7 +101,12 @@ def _backwards(found: RecordedLists) -> float | None:
 
 
 def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float) -> Tracks:
-    """The unit's tracks with truth ids: list by list the optimal assignment by distance, classes agreeing, gated."""
+    """The unit's tracks with truth ids: list by list the optimal assignment by distance, classes agreeing, gated.
+
+    To leave a pair alone costs as much as the gate, so that no exact pair is given up for another one. Which entry is
+    the ego's own body is settled before, by the ego alone (the nearest whose centre is in its box): it is left out of
+    what fusions see, and what they see must not depend on where others truly are.
+    """
     tracks = found.tracks
     stamps, back = np.unique(tracks.stamp_ns, return_inverse=True)
     world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
@@ -116,11 +124,25 @@ def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m:
         )
         allowed = AGREE[likely[rows][:, None], scene.object_class[world.row_object_ix[there]]]
         allowed &= away_m <= gate_m + 1e-9
+        for ego in np.flatnonzero(world.row_object_ix[there] == scene.ego_ix):
+            body_m = np.where(allowed[:, ego] & _inside(tracks, rows, world, there[ego]), away_m[:, ego], np.inf)
+            if np.isfinite(body_m.min()):
+                object_ix[rows[body_m.argmin()]] = scene.ego_ix
+                allowed[body_m.argmin()] = False
+            allowed[:, ego] = False
         partner = np.full(len(rows), -1)
-        # As many pairs as there can be, and of those the nearest: a pair is worth more than all distances.
-        assign(np.where(allowed, away_m - (len(rows) + 1) * (gate_m + 1.0), np.inf), partner)
+        assign(np.where(allowed, away_m - (gate_m + 2e-9), np.inf), partner)
         object_ix[rows[partner >= 0]] = world.row_object_ix[there[partner[partner >= 0]]]
     return replace(tracks, object_ix=object_ix)
+
+
+def _inside(tracks: Tracks, rows: Int, world: Tracks, body: int) -> Bool:
+    """(K,) whether the centres of `rows` lie in the box of row `body`, or beside it within a margin."""
+    east, north = tracks.x_m[0, rows] - world.x_m[0, body], tracks.y_m[0, rows] - world.y_m[0, body]
+    cos, sin = np.cos(world.yaw_rad[0, body]), np.sin(world.yaw_rad[0, body])
+    ahead, left = np.abs(east * cos + north * sin), np.abs(north * cos - east * sin)
+    inside: Bool = np.maximum(ahead - world.length_m[0, body] / 2, left - world.width_m[0, body] / 2) <= OWN_BODY_M
+    return inside
 
 
 def recorded_units(

@@ -42,6 +42,7 @@ _SCENES: tuple[tuple[str, int, int, float, int, float, float], ...] = (
     ("two units at the same instants", 2, 3, 50.0, 10, 0.0, 0.0),
     ("a crowd", 3, 6, 4.0, 8, 0.1, 0.0),
     ("lists late, out of order and lost", 4, 4, 20.0, 10, 0.5, 0.2),
+    ("lists older than is gone by", 3, 2, 30.0, 6, 2.5, 0.0),
     ("many units", 12, 4, 12.0, 4, 0.2, 0.1),
     ("empty lists", 2, 0, 50.0, 5, 0.1, 0.0),
     ("nothing arrives", 2, 2, 50.0, 3, 0.1, 1.0),

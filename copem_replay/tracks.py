@@ -48,6 +48,9 @@ CLASS_GROUPS = {
 }
 """Names that stand for several classes (`vru`: vulnerable road users)."""
 
+NO_CAPTURE_NS = np.iinfo(np.int64).min
+"""Stamp of a fused list at an instant at which no list is recent enough to go by."""
+
 SAME_INSTANT_NS = 1_000
 """Two instants closer than this are one (1 µs, from the contract)."""
 

@@ -272,6 +272,7 @@ class TestCommand:
             ("cov_nn_m2, value: 0", "cov_*_m2: expected positive definite covariances"),
             ("existence, value: 90", "existence: expected probabilities, found 90 … 90"),
             ("captured_s, value: 9", "captured_s: expected captures that are not in the future"),
+            ("track_id, value: 7", "track_id: expected each once in a list, found one twice (−1: no track is kept)"),
             ("unit_ix, value: 2", "unit_ix: expected −1 … 1, found 2 … 2"),
             ("x_m, value: 13", "TypeError: step: expected a list"),
         ],

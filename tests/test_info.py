@@ -88,7 +88,7 @@ def test_describe(path):
         "log.mcap",
         "  topic  schema                 encoding  messages",
         "  truth  osi3.GroundTruth       protobuf         6  the truth",
-        "  rsu    osi3.SensorData        protobuf         2  lists of a recorded unit, not the truth",
+        "  rsu    osi3.SensorData        protobuf         2  lists of a unit, for `recorded: {topic: …}`",
         "  /odom  nav_msgs/msg/Odometry  cdr              1  not read by this version",
         "truth: truth",
         "  6 frames, 1.500 s, 4.00 Hz (median), longest gap 0.500 s at 0.750 s",
@@ -165,7 +165,7 @@ def test_no_truth_says_what_there_is(path):
         "log.mcap",
         "  topic  schema                 encoding  messages",
         "  /odom  nav_msgs/msg/Odometry  cdr              1  not read by this version",
-        "  rsu    osi3.SensorData        protobuf         2  lists of a recorded unit, not the truth",
+        "  rsu    osi3.SensorData        protobuf         2  lists of a unit, for `recorded: {topic: …}`",
     ]
 
 

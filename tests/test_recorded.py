@@ -26,10 +26,12 @@ from recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_r
 
 
 def car(x: float | None, y: float = 0.0, *, vx: float = 0.0, kinds: Any = ((VEHICLE, CAR, 1.0),),
-        sigma_m: Any = None, existence: float | None = None, track: int = 0) -> DetectedMovingObject:  # fmt: skip
+        sigma_m: Any = None, existence: float | None = None,
+        track: int | None = 0) -> DetectedMovingObject:  # fmt: skip
     """One entry of a recorded list; None: not said. `kinds`: type, vehicle's type, probability of each candidate."""
     one = DetectedMovingObject()
-    one.header.tracking_id.value = track
+    if track is not None:
+        one.header.tracking_id.value = track
     if existence is not None:
         one.header.existence_probability = existence
     if x is not None:
@@ -151,6 +153,33 @@ class TestWhatIsSaid:
         mixed = {"pedestrian": 0.25, "car": 0.75}
         assert said == [mixed, {"other": 1.0}, {"pedestrian": 1.0}, mixed]
 
+    def test_covariance_is_turned_with_the_host(self, tmp_path: Path) -> None:
+        """The host heads north, the sensor 60° to the left of east: 0.1 m along, 2 m across."""
+        for degrees, expected in ((90, [4.0, 0.0, 0.01]), (60, [3.0025, -1.7277207, 1.0075])):
+            stamp, payload = list_of(0.5, car(10, sigma_m=(0.1, 2.0)))
+            data = SensorData.FromString(payload)
+            data.host_vehicle_location.position.x = 5.0
+            data.host_vehicle_location.orientation.yaw = np.deg2rad(90)
+            data.mounting_position.orientation.yaw = np.deg2rad(degrees - 90)
+            path = drive(tmp_path / f"{degrees}.mcap", (stamp, data.SerializeToString()))
+            found = read(path).lists["rsu"].tracks
+            covariance_m2 = [getattr(found, name)[0, 0] for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2")]
+            np.testing.assert_allclose(covariance_m2, expected, atol=1e-6)
+            place = [5 + 10 * np.cos(np.deg2rad(degrees)), 10 * np.sin(np.deg2rad(degrees))]
+            np.testing.assert_allclose([found.x_m[0, 0], found.y_m[0, 0]], place, atol=1e-9)
+
+    def test_who_keeps_no_tracks(self, tmp_path: Path) -> None:
+        """Two cars that pass each other are no track that turns back: nothing is said of their velocities."""
+        lists = [
+            list_of(k / 10, car(30 + 0.8 * k, vx=8.0, track=None), car(100 - 0.8 * k, vx=-8.0, track=None))
+            for k in range(10)
+        ]
+        path = drive(tmp_path / "a.mcap", *lists)
+        assert set(read(path).lists["rsu"].track_id) == {-1}
+        assert not [note for note in read(path).notes if "point against" in note]
+        large = read(drive(tmp_path / "b.mcap", list_of(0.5, car(30, track=2**64 - 1)))).lists["rsu"]
+        assert large.track_id.tolist() == [2**63 - 1]
+
     @pytest.mark.parametrize("x", [np.nan, np.inf, None])
     def test_entries_without_a_place_are_left_out_and_said(self, tmp_path: Path, x: float | None) -> None:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(x, track=7), car(30, track=8), car(x)))
@@ -210,6 +239,21 @@ class TestWhoItIs:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(0.4), car(30)))
         for kind in ("ideal", "union"):
             assert told(path)[kind].lists.of(0, 0)["x_m"].tolist() == [30.0]
+
+    def test_no_exact_pair_is_given_up_for_two(self, tmp_path: Path) -> None:
+        """Entries at 30 and 27.1 m, cars at 30 and 32.95 m: two pairs would be possible, 2.95 and 2.9 m apart."""
+        cars = [Obj(id=1, x=0.0), Obj(id=2, x=30.0), Obj(id=3, x=32.95)]
+        path = drive(tmp_path / "a.mcap", list_of(0.5, car(30.0), car(27.1)), objects=lambda t: cars)
+        assert about(path) == [["2", None]]
+
+    @pytest.mark.parametrize("other_m", [-2.95, -20.0, 30.0])
+    def test_the_own_body_is_known_by_the_ego_alone(self, tmp_path: Path, other_m: float) -> None:
+        """Wherever somebody else truly is: what is listed in the ego's box is the ego, what is 2.9 m ahead is not."""
+        path = drive(
+            tmp_path / "a.mcap", list_of(0.5, car(0.0), car(2.9)), objects=lambda t: [Obj(id=1), Obj(id=2, x=other_m)]
+        )
+        assert about(path)[0][0] == "1"
+        assert told(path)["union"].lists.of(0, 0)["x_m"].tolist() == [2.9]
 
     def test_nobody_but_the_ideal_learns_of_it(self, tmp_path: Path) -> None:
         """The truth has other numbers, another order, or nobody but the ego: the fused lists are the same."""

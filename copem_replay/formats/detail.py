@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from copem_replay.fusion.belief import Belief
-from copem_replay.tracks import UNCERTAINTIES, Scene
+from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Scene
 
 SCHEMA = "copem_replay.ListDetail"
 Event = Mapping[str, Any]
@@ -24,7 +24,7 @@ JSON_SCHEMA = {
     "type": "object",
     "properties": {
         "available_ns": {"type": "integer"},
-        "captured_ns": {"type": "integer"},
+        "captured_ns": {"type": ["integer", "null"]},
         "objects": {
             "type": "array",
             "items": {
@@ -71,9 +71,10 @@ class DetailWriter:
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
+        captured_ns = int(self._fused.stamp_ns[frame])
         content = {
             "available_ns": available_ns,
-            "captured_ns": int(self._fused.stamp_ns[frame]),
+            "captured_ns": None if captured_ns == NO_CAPTURE_NS else captured_ns,
             "objects": [self._object(row) for row in self._listed(frame)],
             "events": list(self._events.get(frame, ())),
         }

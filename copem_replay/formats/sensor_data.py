@@ -14,7 +14,7 @@ import numpy as np
 
 from copem_replay.chance import object_words
 from copem_replay.fusion.belief import Belief
-from copem_replay.tracks import CLASSES, VALUES, Float, Scene
+from copem_replay.tracks import CLASSES, NO_CAPTURE_NS, VALUES, Float, Scene
 
 SCHEMA = "osi3.SensorData"
 OSI_VERSION = (3, 8, 0)
@@ -87,7 +87,8 @@ class SensorDataWriter:
         data.version.version_major, data.version.version_minor, data.version.version_patch = OSI_VERSION
         captured_ns = int(self._fused.stamp_ns[frame])
         _stamp(data.timestamp, available_ns)
-        _stamp(data.last_measurement_time, captured_ns)
+        if captured_ns != NO_CAPTURE_NS:
+            _stamp(data.last_measurement_time, captured_ns)
         data.mounting_position.position.SetInParent()
         data.mounting_position.orientation.SetInParent()
         for row in self._listed(frame):

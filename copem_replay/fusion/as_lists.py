@@ -8,9 +8,7 @@ from copem_replay.fusion.belief import Belief
 from copem_replay.fusion.object_list import COVARIANCES, Lists
 from copem_replay.fusion.reports import Claims, gathered
 from copem_replay.match import MATCH, Matches
-from copem_replay.tracks import CLASSES, VALUES, Float, Int, Scene, Tracks
-
-_EVER = np.iinfo(np.int64).min
+from copem_replay.tracks import CLASSES, NO_CAPTURE_NS, VALUES, Float, Int, Scene, Tracks
 
 
 def as_lists(belief: Belief, scene: Scene) -> Lists:
@@ -46,7 +44,7 @@ def as_belief(lists: Lists, run: int, matches: Matches, heard: Tracks, issue_s: 
         new[1:] &= key[order][1:] == key[order][:-1]
     new[1:] = ~new[1:]
     start = np.append(np.flatnonzero(new), len(order))
-    stamps = np.where(newest >= 0, heard.stamp_ns[newest], _EVER).max(axis=1, initial=_EVER)
+    stamps = np.where(newest >= 0, heard.stamp_ns[newest], NO_CAPTURE_NS).max(axis=1, initial=NO_CAPTURE_NS)
     captured = np.where(newest >= 0, heard.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
     fused = Tracks(
         units=("fused",),

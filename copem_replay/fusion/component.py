@@ -131,6 +131,12 @@ def content_problem(found: Lists, reports: Reports) -> str | None:
     now_s = np.repeat(np.tile(reports.issue_s, len(found.start)), np.diff(found.start, axis=1).ravel())
     if (found.entries["captured_s"] > now_s + 1e-6).any():
         return "captured_s: expected captures that are not in the future"
+    tracked = found.entries["track_id"] >= 0
+    of_list = np.repeat(np.arange(found.start[:, 1:].size), np.diff(found.start, axis=1).ravel())[tracked]
+    order = np.lexsort((found.entries["track_id"][tracked], of_list))
+    twice = np.diff(of_list[order]) == 0
+    if (twice & (np.diff(found.entries["track_id"][tracked][order]) == 0)).any():
+        return "track_id: expected each once in a list, found one twice (−1: no track is kept)"
     unit_ix = found.entries["unit_ix"]
     if ((unit_ix < -1) | (unit_ix >= len(reports.units))).any():
         return f"unit_ix: expected −1 … {len(reports.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"

@@ -15,7 +15,7 @@ import numpy as np
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.fusion.belief import Belief
 from copem_replay.fusion.instants import instants
-from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
 
 SMALLEST_VARIANCE = 1e-9
 """A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
@@ -47,7 +47,7 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Bel
     sin, yaw_variance = _combine(heard, np.sin(yaw), "yaw_var_rad2", rows, start)
     out["yaw_rad"] = np.arctan2(sin, _combine(heard, np.cos(yaw), "yaw_var_rad2", rows, start)[0])
     captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
-    stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], np.iinfo(np.int64).min).max(axis=1)
+    stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], NO_CAPTURE_NS).max(axis=1)
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
     fused = Tracks(
         units=("fused",),
