@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment, minimize
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
 from copem_replay.tracks import CLASS_GROUPS, CLASSES
@@ -100,7 +102,7 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
         cost = np.zeros(allowed.shape)
         if allowed.any():
             spread = np.log(det[allowed])
-            cost[allowed] = d2[allowed] + spread - (threshold + spread.max()) - 1e-9
+            cost[allowed] = d2[allowed] + spread - (threshold + largest_around(allowed, spread)) - 1e-9
         chosen, partner = linear_sum_assignment(cost)
         paired = allowed[chosen, partner]
         c, e = chosen[paired], partner[paired] + a
@@ -118,6 +120,18 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
         mean, cov = np.concatenate([mean, x[new]]), np.concatenate([cov, P[new]])
         inverse, sums = np.concatenate([inverse, information[new]]), np.concatenate([sums, probability[new]])
     return cluster
+
+
+def largest_around(allowed: Array, value: Array) -> Array:
+    """(P,) the largest `value (P,)` in the connected component of each of the allowed pairs (n, m)."""
+    row, col = np.nonzero(allowed)
+    n, m = allowed.shape
+    links = coo_array((np.ones(len(row)), (row, n + col)), shape=(n + m, n + m))
+    count, component = connected_components(links, directed=False)
+    top = np.full(count, -np.inf)
+    np.maximum.at(top, component[row], value)
+    largest: Array = top[component[row]]
+    return largest
 
 
 def _summaries(

@@ -18,6 +18,7 @@ from copem_replay.fusion.component import fused_by
 from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.tracks import CLASSES
+from gnn_oracle import largest_around
 from reports import entry, joined, lists_of, reports_of
 
 Array = npt.NDArray[Any]
@@ -100,14 +101,16 @@ class Plain:
                 d2 = float(difference @ np.linalg.inv(S) @ difference)
                 if d2 <= self.gate and AGREE[np.argmax(e["class_probability"]), track.kind]:
                     pairs[i, j] = (d2, math.log(np.linalg.det(S)))
+        allowed = np.zeros((len(entries), len(self.tracks)), dtype=bool)
+        for pair in pairs:
+            allowed[pair] = True
+        around = largest_around(allowed, np.array([volume for _, volume in pairs.values()]))
         # Columns: the tracks, and for each entry a place of its own where it is alone.
         cost = np.full((len(entries), len(self.tracks) + len(entries)), 1e9)
-        for i in range(len(entries)):
-            cost[i, len(self.tracks) + i] = (
-                self.gate + max((volume for _, volume in pairs.values()), default=0.0) + 1e-6
-            )
-        for (i, j), (d2, volume) in pairs.items():
+        np.fill_diagonal(cost[:, len(self.tracks) :], 0.0)
+        for ((i, j), (d2, volume)), most in zip(pairs.items(), around, strict=True):
             cost[i, j] = d2 + volume
+            cost[i, len(self.tracks) + i] = self.gate + most + 1e-6
         partner = dict(zip(*(side.tolist() for side in linear_sum_assignment(cost)), strict=True))
         known = len(self.tracks)
         for i, e in enumerate(entries):
@@ -508,6 +511,16 @@ def converging(units: Sequence[str]) -> list[Entries]:
     times = [0.0] * len(units) + [0.25, 0.875, 1.25]
     reports = reports_of([[*lists, *[entries_of(0)] * 3]], [*units, *["blind"] * 3], times, times)
     return fuse_one(reports, publish=0.2, **AT_ONCE)
+
+
+@pytest.mark.parametrize("sigma_m", [None, 0.5, 2.0, 10.0, 100.0])
+def test_who_is_who_here_does_not_depend_on_what_is_far_away(sigma_m: float | None):
+    # The second list says 0.2 and −3.9 of tracks at 0 and 4: 0.2 is far more likely the first, though −3.9 is then new.
+    far = [] if sigma_m is None else [entry(500.0, of="truck", cov=(sigma_m**2, 0.0, sigma_m**2))]
+    lists = [[joined(*(entry(x, of="pedestrian") for x in xs), *far) for xs in ((0.0, 4.0), (0.2, -3.9))]]
+    found = fuse_one(reports_of(lists, ["a", "b"], [0.0, 0.01], [0.0, 0.01]), gate=0.99, **AT_ONCE)[-1]
+    here = np.sort(found["x_m"][found["x_m"] < 100.0])
+    assert here == pytest.approx([-3.9, 0.1, 4.0], abs=1e-3)
 
 
 def test_of_two_tracks_that_come_together_the_one_founded_later_ends():

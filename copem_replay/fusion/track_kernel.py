@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.assignment import assign_pairs
+from copem_replay.assignment import assign_pairs, largest_around
 from copem_replay.fusion.combine import floored
 from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
@@ -241,8 +241,8 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
     class_ix = np.empty(n, np.int64)
     for i in range(n):
         class_ix[i] = _most_probable(said.entries[rows[i]].class_probability)
-    row, col, cost = np.empty(n * m, np.int64), np.empty(n * m, np.int64), np.empty(n * m)
-    pairs, most = 0, -np.inf
+    row, col = np.empty(n * m, np.int64), np.empty(n * m, np.int64)
+    cost, spread, pairs = np.empty(n * m), np.empty(n * m), 0
     for j in range(m):
         track = tracks[j]
         agree = rules.agree[track.class_ix]
@@ -255,12 +255,15 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
                 continue
             d2 = distance2(dx, dy, a, b, d)
             if d2 <= rules.gate:
-                log_det = math.log(a * d - b * b)
-                row[pairs], col[pairs], cost[pairs] = i, j, d2 + log_det
-                most = max(most, log_det)
+                row[pairs], col[pairs], spread[pairs] = i, j, math.log(a * d - b * b)
+                cost[pairs] = d2 + spread[pairs]
                 pairs += 1
+    row, col, cost, spread = row[:pairs], col[:pairs], cost[:pairs], spread[:pairs]
     # Alone costs 0: shifted so that any pair within the gate is better than none.
-    assign_pairs(row[:pairs], col[:pairs], cost[:pairs] - (rules.gate + most + _LEAST_COST), n, m, partner)
+    largest_around(row, col, spread, n, m)
+    for p in range(pairs):
+        cost[p] -= rules.gate + spread[p] + _LEAST_COST
+    assign_pairs(row, col, cost, n, m, partner)
     return partner
 
 
