@@ -77,6 +77,12 @@ def _agree() -> Array:
 AGREE = _agree()
 
 
+def _kinds(probability: Array) -> Array:
+    """(N,) the most probable class of each; `other` where none is said to be."""
+    kinds: Array = np.where(probability.any(axis=1), probability.argmax(axis=1), CLASSES.index("other"))
+    return kinds
+
+
 def _mean_cov(entries: Entries) -> tuple[Array, Array]:
     mean = np.stack([entries["x_m"], entries["y_m"]], axis=1)
     cov = np.stack([entries[f"cov_{name}_m2"] for name in ("ee", "en", "en", "nn")], axis=1)
@@ -88,7 +94,7 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
     x, P = _mean_cov(entries)
     information = np.linalg.inv(P)
     probability = entries["class_probability"]
-    kind = probability.argmax(axis=1)
+    kind = _kinds(probability)
     cluster = np.empty(len(entries), dtype=np.int64)
     mean, cov, inverse, sums = x[:0], P[:0], P[:0], probability[:0]
     for a, b in itertools.pairwise(bounds):
@@ -98,7 +104,7 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
         dx, dy = innovation[..., 0], innovation[..., 1]
         det = ee * nn - en * en
         d2 = (nn * dx * dx - 2 * en * dx * dy + ee * dy * dy) / det
-        allowed = (d2 <= threshold) & AGREE[sums.argmax(axis=1)[:, None], kind[None, a:b]]
+        allowed = (d2 <= threshold) & AGREE[_kinds(sums)[:, None], kind[None, a:b]]
         cost = np.zeros(allowed.shape)
         if allowed.any():
             spread = np.log(det[allowed])

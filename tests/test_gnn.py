@@ -156,6 +156,17 @@ def test_only_classes_that_agree_are_joined(classes: tuple[str, str], count: int
     assert len(fused(entry(0.0, of=classes[0]), entry(0.0, of=classes[1]))) == count
 
 
+@pytest.mark.parametrize("named", ["car", "pedestrian", "vehicle"])
+def test_nothing_said_of_the_class_agrees_with_all(named: str):
+    silent = entry(0.0, class_probability=np.zeros(len(CLASSES)))
+    for lists in ([silent, entry(0.0, of=named)], [entry(0.0, of=named), silent]):
+        (one,) = Gnn().fuse(together(*lists, captured_s=[0.2, 0.1])).entries
+        assert one["class_probability"][CLASSES.index(named)] == 0.5
+    # What has been joined is what was said of it.
+    lists = [silent, entry(0.0, of=named), entry(0.0, of="bicycle")]
+    assert len(Gnn().fuse(together(*lists, captured_s=[0.3, 0.2, 0.1])).entries) == 2
+
+
 def test_a_cluster_is_of_the_class_its_members_make_most_probable():
     # At first `other`, which agrees with everything; the car makes it one: 1.4 of 2.
     unsure = np.zeros(len(CLASSES))

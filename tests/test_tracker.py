@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.fusion.agree import AGREE
+from copem_replay.fusion.agree import AGREE, most_probable, most_probable_of_each
 from copem_replay.fusion.component import fused_by
 from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
 from copem_replay.fusion.tracker import Tracker
@@ -561,6 +561,17 @@ def test_many_units_do_not_split_an_object_in_two():
     assert max(counts) <= 2
     first = found[1]["track_id"][0]
     assert all(first in one["track_id"] for one in found[1:])
+
+
+def test_the_most_probable_class_is_the_first_of_equals_and_other_where_nothing_is_said():
+    other = CLASSES.index("other")
+    said = np.zeros((5, len(CLASSES)))
+    said[1, [3, other]] = 0.5
+    said[2, [3, 4]] = 0.4, 0.6
+    said[3, other] = 1e-3
+    said[4, [0, 4]] = 0.5
+    assert [most_probable(one) for one in said] == [other, 3, 4, other, 0]
+    assert most_probable_of_each(said).tolist() == [other, 3, 4, other, 0]
 
 
 def test_classes_that_agree():

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.assignment import assign_pairs, largest_around
+from copem_replay.fusion.agree import most_probable
 from copem_replay.fusion.combine import covariance_intersection, fast_covariance_intersection, floored
 from copem_replay.fusion.content_order import compare_rows, sort_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
@@ -98,7 +99,7 @@ def fuse_run(
                 for h in range(len(CLASSES)):
                     class_sum[c, h] += entries[point.row].class_probability[h]
                 if states[c].kind != point.kind:
-                    states[c].kind = np.argmax(class_sum[c])
+                    states[c].kind = most_probable(class_sum[c])
                 joining[joined], claimed[joined] = a + i, c
                 joined += 1
             _sort_by_x(states, by_x[:count])
@@ -153,7 +154,7 @@ def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_exis
             point, entry = points[i], entries[rows[i]]
             point.x_m, point.y_m = entry.x_m, entry.y_m
             point.ee, point.en, point.nn = floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
-            point.kind = np.argmax(entry.class_probability)
+            point.kind = most_probable(entry.class_probability)
             point.row, point.list = rows[i], f
     return points, first
 
@@ -199,7 +200,7 @@ def _list_before(
 def _allowed_pairs(
     here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
 ) -> tuple[Int, Int, Float, Float, int]:
-    """Pairs within the gate whose classes agree: entry, cluster, cost below 0, and to work with the largest ln|S| around.
+    """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component.
 
     The arrays are those given, longer if need be.
     """

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.assignment import assign_pairs, largest_around
+from copem_replay.fusion.agree import most_probable
 from copem_replay.fusion.combine import floored
 from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
@@ -27,7 +28,6 @@ SAME_OBJECT = 1.386
 """Tracks whose next entries would be as close as this, d², can be of one object: the median of χ² with 2 degrees of
 freedom (chosen), so half of the pairs of entries of one object are closer."""
 _SAME_S = SAME_INSTANT_NS * 1e-9
-_OTHER = CLASSES.index("other")
 _LEAST_COST = 1e-6
 """What the worst pair within the gate is better than none (chosen: small against the differences between pairs)."""
 
@@ -240,7 +240,7 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
         return partner
     class_ix = np.empty(n, np.int64)
     for i in range(n):
-        class_ix[i] = _most_probable(said.entries[rows[i]].class_probability)
+        class_ix[i] = most_probable(said.entries[rows[i]].class_probability)
     row, col = np.empty(n * m, np.int64), np.empty(n * m, np.int64)
     cost, spread, pairs = np.empty(n * m), np.empty(n * m), 0
     for j in range(m):
@@ -265,16 +265,6 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
         cost[p] -= rules.gate + spread[p] + _LEAST_COST
     assign_pairs(row, col, cost, n, m, partner)
     return partner
-
-
-@nb.njit(cache=True, nogil=True)
-def _most_probable(probability: Float) -> int:
-    """Index of the largest, the first of equals; `other` where nothing is said."""
-    best = _OTHER
-    for c in range(len(probability)):
-        if probability[c] > probability[best] or (probability[c] == probability[best] > 0 and c < best):
-            best = c
-    return best
 
 
 @nb.njit(cache=True, nogil=True)
@@ -307,7 +297,7 @@ def _describe(track: Any, entry: Any, captured_s: float) -> None:
     track.height_m += entry.height_m
     for c in range(len(CLASSES)):
         track.class_probability[c] += entry.class_probability[c]
-    track.class_ix = _most_probable(track.class_probability)
+    track.class_ix = most_probable(track.class_probability)
     track.count += 1
 
 
