@@ -52,7 +52,8 @@ TRACK = np.dtype(
     ]
 )  # fmt: skip
 CLAIM = np.dtype([("existence", "f8"), ("at_s", "f8")])
-"""The last thing a unit said of a track, and when; nothing yet: zeros."""
+"""The newest thing a unit said of a track, and since when that fades: its capture (`stale`: when it was heard). Nothing
+yet: 0, −inf."""
 
 
 class Memory(NamedTuple):
@@ -189,6 +190,7 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
         if track.at_s < now_s:
             predict(track.state, track.P, now_s - track.at_s, rules.q_m2ps3)
             track.at_s = now_s
+    said_s = now_s if rules.late == STALE else said.captured_s[f]
     seen = _seen(said, rules, f, now_s)
     rows = said.rows[said.start[f] : said.start[f + 1]]
     partner = _partners(memory.tracks, said, rules, rows, seen)
@@ -209,7 +211,8 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
         track.ee, track.en, track.nn = ee, en, nn
         _describe(track, entry, said.captured_s[f])
         claim = memory.claims[partner[i], said.unit_ix[f]]
-        claim.existence, claim.at_s = entry.existence, now_s
+        if said_s >= claim.at_s:
+            claim.existence, claim.at_s = entry.existence, said_s
     for j in partner:
         for k in partner:
             memory.together_s[j, k] = now_s
@@ -275,6 +278,8 @@ def _with_room(memory: Memory, more: int) -> Memory:
     n, units = memory.claims.shape
     tracks, claims = np.zeros(n + more, TRACK), np.zeros((n + more, units), CLAIM)
     together_s = np.full((n + more, n + more), -np.inf)
+    for claim in claims[n:].flat:
+        claim.at_s = -np.inf
     tracks[:n], claims[:n], together_s[:n, :n] = memory.tracks, memory.claims, memory.together_s
     return Memory(tracks, claims, together_s)
 
