@@ -1,7 +1,8 @@
 """Optimal assignment where most pairs are ruled out: the pairs of least total cost, no row and no column twice.
 
 Whoever is left alone costs 0, so a pair of cost 0 or more is never chosen: callers take the price of leaving both
-alone off the cost of each pair. A row and a column that are each other's only choice are settled at once; the rest is
+alone off the cost of each pair. The price may differ between connected components of the pairs, which do not compete:
+`largest_around` is for that. A row and a column that are each other's only choice are settled at once; the rest is
 solved row after row by shortest augmenting paths over the allowed pairs, which never leave the row's connected
 component. Every row has, beside its pairs, a way out of its own at cost 0.
 
@@ -79,6 +80,37 @@ def assign_pairs(row: Int, col: Int, cost: Float, n: int, m: int, partner: Int) 
             choice[fill[i]], price[fill[i]] = col[k], cost[k]
             fill[i] += 1
     _augment(start, choice, price, n, m, partner)
+
+
+@nb.njit(cache=True, nogil=True)
+def largest_around(row: Int, col: Int, value: Float, n: int, m: int) -> None:
+    """Puts the largest `value (P,)` of its connected component in the place of each pair's own."""
+    parent, top = np.empty(n, np.int64), np.empty(n)
+    for i in range(n):
+        parent[i], top[i] = i, -np.inf
+    of_col = np.full(m, -1)  # a row of the component of each column
+    for k in range(len(value)):
+        i, j = _root(parent, row[k]), col[k]
+        if of_col[j] >= 0:
+            other = _root(parent, of_col[j])
+            if other != i:
+                parent[other] = i
+                if top[other] > top[i]:
+                    top[i] = top[other]
+        of_col[j] = i
+        if value[k] > top[i]:
+            top[i] = value[k]
+    for k in range(len(value)):
+        value[k] = top[_root(parent, row[k])]
+
+
+@nb.njit(cache=True, nogil=True)
+def _root(parent: Int, i: int) -> int:
+    """The row that stands for the component of row i; the way there gets shorter."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
 
 
 @nb.njit(cache=True, nogil=True)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.fusion.agree import AGREE
+from copem_replay.fusion.agree import most_probable as most_probable_class
 from copem_replay.fusion.object_list import Entries, Lists
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
 
@@ -56,13 +57,8 @@ def match(lists: Lists, world: Tracks, scene: Scene, *, gate_m: float) -> Matche
 
 @nb.njit(cache=True, nogil=True)
 def most_probable(entries: Entries, i: int) -> int:
-    """The most probable class of entry i; of equally probable ones the first."""
-    claimed = entries[i].class_probability
-    best = 0
-    for c in range(1, len(claimed)):
-        if claimed[c] > claimed[best]:
-            best = c
-    return best
+    """The most probable class of entry i; of equally probable ones the first, `other` where nothing is said."""
+    return most_probable_class(entries[i].class_probability)
 
 
 @nb.njit(cache=True, nogil=True)

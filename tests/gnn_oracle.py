@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment, minimize
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
 from copem_replay.tracks import CLASS_GROUPS, CLASSES
@@ -75,6 +77,12 @@ def _agree() -> Array:
 AGREE = _agree()
 
 
+def _kinds(probability: Array) -> Array:
+    """(N,) the most probable class of each; `other` where none is said to be."""
+    kinds: Array = np.where(probability.any(axis=1), probability.argmax(axis=1), CLASSES.index("other"))
+    return kinds
+
+
 def _mean_cov(entries: Entries) -> tuple[Array, Array]:
     mean = np.stack([entries["x_m"], entries["y_m"]], axis=1)
     cov = np.stack([entries[f"cov_{name}_m2"] for name in ("ee", "en", "en", "nn")], axis=1)
@@ -86,7 +94,7 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
     x, P = _mean_cov(entries)
     information = np.linalg.inv(P)
     probability = entries["class_probability"]
-    kind = probability.argmax(axis=1)
+    kind = _kinds(probability)
     cluster = np.empty(len(entries), dtype=np.int64)
     mean, cov, inverse, sums = x[:0], P[:0], P[:0], probability[:0]
     for a, b in itertools.pairwise(bounds):
@@ -96,11 +104,11 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
         dx, dy = innovation[..., 0], innovation[..., 1]
         det = ee * nn - en * en
         d2 = (nn * dx * dx - 2 * en * dx * dy + ee * dy * dy) / det
-        allowed = (d2 <= threshold) & AGREE[sums.argmax(axis=1)[:, None], kind[None, a:b]]
+        allowed = (d2 <= threshold) & AGREE[_kinds(sums)[:, None], kind[None, a:b]]
         cost = np.zeros(allowed.shape)
         if allowed.any():
             spread = np.log(det[allowed])
-            cost[allowed] = d2[allowed] + spread - (threshold + spread.max()) - 1e-9
+            cost[allowed] = d2[allowed] + spread - (threshold + largest_around(allowed, spread)) - 1e-9
         chosen, partner = linear_sum_assignment(cost)
         paired = allowed[chosen, partner]
         c, e = chosen[paired], partner[paired] + a
@@ -118,6 +126,18 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
         mean, cov = np.concatenate([mean, x[new]]), np.concatenate([cov, P[new]])
         inverse, sums = np.concatenate([inverse, information[new]]), np.concatenate([sums, probability[new]])
     return cluster
+
+
+def largest_around(allowed: Array, value: Array) -> Array:
+    """(P,) the largest `value (P,)` in the connected component of each of the allowed pairs (n, m)."""
+    row, col = np.nonzero(allowed)
+    n, m = allowed.shape
+    links = coo_array((np.ones(len(row)), (row, n + col)), shape=(n + m, n + m))
+    count, component = connected_components(links, directed=False)
+    top = np.full(count, -np.inf)
+    np.maximum.at(top, component[row], value)
+    largest: Array = top[component[row]]
+    return largest
 
 
 def _summaries(

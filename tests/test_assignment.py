@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.assignment import assign, assign_pairs
+from copem_replay.assignment import assign, assign_pairs, largest_around
+from gnn_oracle import largest_around as largest_by_scipy
 
 Cost = npt.NDArray[np.float64]
 NOT = np.inf
@@ -191,3 +192,24 @@ def test_of_points_it_is_the_assignment_of_scipy(seed: int, gate_m: float):
 def test_of_many_points_too(n: int, m: int, gate_m: float):
     cost = near_pairs(np.random.default_rng(3), n, m, side_m=90.0, gate_m=gate_m)
     assert partners(cost) == by_scipy(cost)
+
+
+@given(st.integers(0, 12), st.integers(1, 12), st.floats(0.0, 0.5), st.integers(0, 999))
+def test_the_largest_around_is_that_of_the_connected_component(n: int, m: int, share: float, seed: int):
+    rng = np.random.default_rng(seed)
+    allowed = rng.random((n, m)) < share
+    row, col = np.nonzero(allowed)
+    value = rng.integers(-3, 4, len(row)).astype(float)
+    expected = largest_by_scipy(allowed, value)
+    order = rng.permutation(len(row))
+    found = value[order]
+    largest_around(row[order], col[order], found, n, m)
+    assert found.tolist() == expected[order].tolist()
+
+
+def test_a_chain_is_one_component_and_its_end_is_heard_at_the_other():
+    row, col = np.repeat(np.arange(500), 2)[1:], np.repeat(np.arange(500), 2)[:-1]
+    for order in (slice(None), slice(None, None, -1)):
+        value = np.arange(len(row), dtype=float)
+        largest_around(row[order], col[order], value, 500, 500)
+        assert (value == len(row) - 1).all()

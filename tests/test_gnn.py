@@ -112,6 +112,22 @@ def test_a_vague_cluster_does_not_draw_what_is_nearer_to_a_sure_one():
     assert found["x_m"].tolist() == pytest.approx([0.5, 3.0])
 
 
+@pytest.mark.parametrize("combine", COMBINATIONS)
+@pytest.mark.parametrize("sigma_m", [None, 0.5, 1.2, 10.0, 1e3])
+def test_who_is_who_here_does_not_depend_on_what_is_far_away(sigma_m: float | None, combine: str):
+    # To pair all four, 0.1 with −3.1 and 3.1 with 0, costs d² of 9.925; the two in the middle and two alone, 9.215.
+    far = [] if sigma_m is None else [entry(500.0, of="truck", cov=(sigma_m**2, 0.0, sigma_m**2))]
+    units = [joined(*(entry(x, of="pedestrian") for x in here), *far) for here in ((0.1, 3.1), (0.0, -3.1))]
+    assert xs(*units, combine=combine) == pytest.approx([-3.1, 0.05, 3.1] + [500.0] * len(far))
+
+
+def test_what_is_joined_to_a_vague_pair_by_others_shares_its_price():
+    # As above; but now a vague pair is within reach of 3.1, and to be alone costs its ln|S| more.
+    vague = [entry(6.0, of="pedestrian", cov=(4.0, 0.0, 4.0))]
+    units = [joined(*(entry(x, of="pedestrian") for x in here), *vague) for here in ((0.1, 3.1), (0.0, -3.1))]
+    assert xs(*units) == pytest.approx([-1.5, 1.55, 6.0])
+
+
 def test_no_unit_is_twice_in_one_cluster():
     assert xs(entry(0.0), joined(entry(0.3), entry(0.1))) == pytest.approx([0.05, 0.3])
     assert xs(joined(entry(0.0), entry(0.0))) == [0.0, 0.0]
@@ -138,6 +154,17 @@ def test_a_cluster_is_where_its_members_so_far_are():
 )
 def test_only_classes_that_agree_are_joined(classes: tuple[str, str], count: int):
     assert len(fused(entry(0.0, of=classes[0]), entry(0.0, of=classes[1]))) == count
+
+
+@pytest.mark.parametrize("named", ["car", "pedestrian", "vehicle"])
+def test_nothing_said_of_the_class_agrees_with_all(named: str):
+    silent = entry(0.0, class_probability=np.zeros(len(CLASSES)))
+    for lists in ([silent, entry(0.0, of=named)], [entry(0.0, of=named), silent]):
+        (one,) = Gnn().fuse(together(*lists, captured_s=[0.2, 0.1])).entries
+        assert one["class_probability"][CLASSES.index(named)] == 0.5
+    # What has been joined is what was said of it.
+    lists = [silent, entry(0.0, of=named), entry(0.0, of="bicycle")]
+    assert len(Gnn().fuse(together(*lists, captured_s=[0.3, 0.2, 0.1])).entries) == 2
 
 
 def test_a_cluster_is_of_the_class_its_members_make_most_probable():

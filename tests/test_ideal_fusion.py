@@ -168,6 +168,31 @@ class TestWeights:
         crossing = at_once(gauss(5, 5, rising), gauss(3, -3, falling))
         assert place(crossing) == pytest.approx((0, 0), abs=1e-6)
 
+    @pytest.mark.parametrize("size", [1.0, 1e2, 1e4, 1e6, 1e8])
+    def test_large_singular_covariances(self, size: float) -> None:
+        """However long the line along which units err: across it no eigenvalue is below 1e-12 of the other."""
+        rising, low = [[size, size], [size, size]], max(1e-9, 2e-12 * size)
+        alone = at_once(gauss(3, -4, rising))
+        assert place(alone) == (3, -4)
+        np.testing.assert_allclose(covariance(alone), rising, rtol=1e-6)
+        small, large = np.linalg.eigvalsh(covariance(alone))
+        assert (small, large) == (pytest.approx(low, rel=1e-3), pytest.approx(2 * size))
+        same = at_once(gauss(0, 0, rising), gauss(2, 2, rising))
+        assert place(same) == pytest.approx((1, 1), rel=1e-3)
+        np.testing.assert_allclose(covariance(same), np.array(rising) / 2, rtol=1e-3)
+        # One that errs by 1 m all round: along the line it decides, across it the others do.
+        with_round = at_once(gauss(0, 0, rising), gauss(1, -1, SMALL))
+        np.testing.assert_allclose(covariance(with_round), np.full((2, 2), size / (1 + 2 * size)), rtol=1e-3)
+        assert place(with_round) == pytest.approx((0, 0), abs=1e-3)
+
+    @pytest.mark.parametrize(
+        "c", [[[0.7, 0.1], [0.1, 0.3]], [[4e8, 0.3], [0.3, 1.1e-3]], [[2e-9, 1e-10], [1e-10, 3e-9]]]
+    )
+    def test_what_one_unit_says_alone_stays_as_it_is(self, c: list[list[float]]) -> None:
+        found = at_once(gauss(4e5 + 0.1, -5e6 + 0.3, c))
+        assert place(found) == (4e5 + 0.1, -5e6 + 0.3)
+        assert covariance(found) == c
+
     def test_far_from_the_origin_nothing_is_lost(self) -> None:
         found = at_once(gauss(4e5, 5e6, NONE), gauss(4e5 + 2e-3, 5e6 - 2e-3, NONE))
         assert place(found) == pytest.approx((4e5 + 1e-3, 5e6 - 1e-3), abs=1e-8)

@@ -116,6 +116,12 @@ def test_the_most_probable_class_counts() -> None:
     assert of_one_list(unsure, objects=objects) == [(1, MATCH)]
 
 
+@pytest.mark.parametrize("true", ["car", "pedestrian", "truck"])
+def test_nothing_said_of_the_class_agrees_with_all(true: str) -> None:
+    silent = entry(0, class_probability=np.zeros(len(CLASSES)))
+    assert of_one_list(silent, objects={(0, 0): true}) == [(0, MATCH)]
+
+
 @pytest.mark.parametrize(("x_m", "y_m"), [(3.0, 0.0), (-3.0, 0.0), (1.8, 2.4), (0.0, -3.0)])
 def test_the_gate_holds_its_bound(x_m: float, y_m: float) -> None:
     objects = {(100.0, -50.0): "car"}

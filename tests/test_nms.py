@@ -111,6 +111,12 @@ def test_less_likely_entries_neither_stay_nor_suppress():
     assert kept(Nms(min_existence=0.5), entry(0.0, existence=0.49)) == []
 
 
+@pytest.mark.parametrize("named", ["car", "pedestrian"])
+def test_nothing_said_of_the_class_agrees_with_all(named: str):
+    silent = entry(0.0, class_probability=np.zeros(len(CLASSES)))
+    assert kept(Nms(), entry(0.5, of=named, existence=0.5), silent) == [0.0]
+
+
 def test_a_list_that_is_too_old_suppresses_no_more():
     # The certain one is at the receiver for 1 s.
     lists = [entry(0.0), entry(0.5, existence=0.5), entry(0.6, existence=0.5)]

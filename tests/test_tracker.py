@@ -13,11 +13,12 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.fusion.agree import AGREE
+from copem_replay.fusion.agree import AGREE, most_probable, most_probable_of_each
 from copem_replay.fusion.component import fused_by
 from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.tracks import CLASSES
+from gnn_oracle import largest_around
 from reports import entry, joined, lists_of, reports_of
 
 Array = npt.NDArray[Any]
@@ -78,6 +79,10 @@ class Plain:
         places = [(float(e["x_m"]), float(e["y_m"])) for e in entries]
         return self.reports.captured_s[f], -len(entries), places
 
+    def outruns(self, g: int, f: int) -> bool:
+        same_unit = self.reports.unit_ix[g] == self.reports.unit_ix[f]
+        return bool(same_unit and self.reports.captured_s[g] > self.reports.captured_s[f])
+
     def hear(self, f: int, now_s: float) -> None:
         captured_s, unit = float(self.reports.captured_s[f]), int(self.reports.unit_ix[f])
         q = self.of.acceleration_psd_m2ps3
@@ -100,14 +105,16 @@ class Plain:
                 d2 = float(difference @ np.linalg.inv(S) @ difference)
                 if d2 <= self.gate and AGREE[np.argmax(e["class_probability"]), track.kind]:
                     pairs[i, j] = (d2, math.log(np.linalg.det(S)))
+        allowed = np.zeros((len(entries), len(self.tracks)), dtype=bool)
+        for pair in pairs:
+            allowed[pair] = True
+        around = largest_around(allowed, np.array([volume for _, volume in pairs.values()]))
         # Columns: the tracks, and for each entry a place of its own where it is alone.
         cost = np.full((len(entries), len(self.tracks) + len(entries)), 1e9)
-        for i in range(len(entries)):
-            cost[i, len(self.tracks) + i] = (
-                self.gate + max((volume for _, volume in pairs.values()), default=0.0) + 1e-6
-            )
-        for (i, j), (d2, volume) in pairs.items():
+        np.fill_diagonal(cost[:, len(self.tracks) :], 0.0)
+        for ((i, j), (d2, volume)), most in zip(pairs.items(), around, strict=True):
             cost[i, j] = d2 + volume
+            cost[i, len(self.tracks) + i] = self.gate + most + 1e-6
         partner = dict(zip(*(side.tolist() for side in linear_sum_assignment(cost)), strict=True))
         known = len(self.tracks)
         for i, e in enumerate(entries):
@@ -127,7 +134,9 @@ class Plain:
             if captured_s >= track.last_s:
                 track.newest = e
             track.first_s, track.last_s = min(track.first_s, captured_s), max(track.last_s, captured_s)
-            track.claims[unit] = float(e["existence"]), now_s
+            said_s = now_s if self.of.late == "stale" else captured_s
+            if unit not in track.claims or said_s >= track.claims[unit][1]:
+                track.claims[unit] = float(e["existence"]), said_s
             track.lists[f] = now_s
 
     def settle(self, now_s: float) -> None:
@@ -178,8 +187,10 @@ class Plain:
                     if n + 1 == len(heard) or self.reports.captured_s[heard[n + 1]] > captured_s:
                         self.settle(captured_s)
             else:
-                for f in sorted(self.reports.arrived[begin:end].tolist(), key=self.order):
-                    self.hear(f, now_s)
+                there = self.reports.arrived[:end].tolist()
+                for f in sorted(there[begin:], key=self.order):
+                    if self.of.late == "predict" or not any(self.outruns(g, f) for g in there):
+                        self.hear(f, now_s)
                 self.settle(now_s)
             found.append(self.published(now_s))
         return found
@@ -285,7 +296,8 @@ def test_a_late_entry_is_moved_to_now_by_its_own_velocity():
     (one,) = fuse_one(reports, late="predict", acceleration_psd_m2ps3=0.6, **AT_ONCE)[0]
     assert (one["x_m"], one["y_m"], one["vx_mps"], one["vy_mps"]) == pytest.approx((3.0, 1.0, 4.0, -2.0))
     assert (one["cov_ee_m2"], one["cov_en_m2"], one["cov_nn_m2"]) == pytest.approx((0.525, 0.1, 0.275))
-    assert (one["captured_s"], one["existence"]) == (1.0, 1.0)
+    assert one["captured_s"] == 1.0
+    assert one["existence"] == pytest.approx(math.exp(-0.5))
     (stale,) = fuse_one(reports, late="stale", **AT_ONCE)[0]
     assert (stale["x_m"], stale["y_m"], stale["cov_ee_m2"], stale["existence"]) == pytest.approx((1.0, 2.0, 0.5, 1.0))
     # Heard at its capture: the track itself is what moves on, its speed unsure by 3 m/s, and the claim is 0.5 s old.
@@ -454,6 +466,52 @@ def test_units_claim_independently_each_with_its_own_age(late: str):
     assert one["existence"] == pytest.approx(expected, abs=1e-12)
 
 
+def test_existence_fades_from_capture_and_stale_from_arrival():
+    # Captured at 0, there at 1.5 s, looked at again at 2 s. Taken for the present it is of 1.5 s.
+    reports = reports_of([[entry(0.0, existence=0.9), entries_of(0)]], ["a", "b"], [0.0, 2.0], [1.5, 2.0])
+    for late, ages_s in (("stale", (0.0, 0.5)), ("predict", (1.5, 2.0)), ("replay", (1.5, 2.0))):
+        found = fuse_one(reports, late=late, publish=0.05, **AT_ONCE)
+        claimed = [one["existence"][0] for one in found]
+        assert claimed == pytest.approx([0.9 * math.exp(-age_s) for age_s in ages_s], abs=1e-12), late
+
+
+@pytest.mark.parametrize("late", LATE)
+def test_an_older_list_does_not_override_what_its_unit_said_later(late: str):
+    # What a captured at 0.2 s is there at once; what it captured at 0.1 s comes at 0.3 s.
+    lists = [[entry(0.0, existence=0.9, yaw_rad=1.0), entry(1.0, existence=0.3, yaw_rad=2.0)]]
+    (one,) = fuse_one(reports_of(lists, ["a", "a"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
+    assert one["existence"] == pytest.approx(0.9 * math.exp(-0.1), abs=1e-12)
+    assert (one["yaw_rad"], one["captured_s"]) == (1.0, 0.2)
+    # Its place is of use where it is not taken for a present one.
+    assert (one["x_m"] == 0.0) == (late == "stale")
+
+
+@pytest.mark.parametrize("late", LATE)
+def test_another_units_older_list_counts(late: str):
+    lists = [[entry(0.0, existence=0.9), entry(1.0, existence=0.3)]]
+    (one,) = fuse_one(reports_of(lists, ["a", "b"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
+    age_s = 0.0 if late == "stale" else 0.2
+    expected = 1 - (1 - 0.9 * math.exp(-0.1)) * (1 - 0.3 * math.exp(-age_s))
+    assert one["existence"] == pytest.approx(expected, abs=1e-12)
+    assert one["x_m"] > 0.1
+
+
+def test_what_only_the_older_list_holds_is_known_from_its_capture_and_not_to_stale():
+    lists = [[entry(0.0, existence=0.9), entry(50.0, existence=0.8)]]
+    reports = reports_of(lists, ["a", "a"], [0.2, 0.1], [0.2, 0.3])
+    assert fuse_one(reports, late="stale", **AT_ONCE)[-1]["x_m"].tolist() == [0.0]
+    for late in ("predict", "replay"):
+        found = np.sort(fuse_one(reports, late=late, **AT_ONCE)[-1], order="x_m")
+        assert found["x_m"].tolist() == [0.0, 50.0]
+        assert found["existence"] == pytest.approx([0.9 * math.exp(-0.1), 0.8 * math.exp(-0.2)], abs=1e-12)
+
+
+def test_of_two_lists_of_a_unit_that_come_together_stale_takes_the_newer():
+    lists = [[entry(4.0, existence=0.3), entry(0.0, existence=0.9)]]
+    (one,) = fuse_one(reports_of(lists, ["a", "a"], [0.1, 0.2], [0.3, 0.3]), late="stale", **AT_ONCE)[-1]
+    assert (one["x_m"], one["existence"], one["captured_s"]) == (0.0, 0.9, 0.2)
+
+
 def test_a_track_is_confirmed_by_the_time_between_its_lists_not_by_their_number():
     times = [0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.12]
     lists = [[entry(0.0) for _ in times]]
@@ -510,6 +568,16 @@ def converging(units: Sequence[str]) -> list[Entries]:
     return fuse_one(reports, publish=0.2, **AT_ONCE)
 
 
+@pytest.mark.parametrize("sigma_m", [None, 0.5, 2.0, 10.0, 100.0])
+def test_who_is_who_here_does_not_depend_on_what_is_far_away(sigma_m: float | None):
+    # The second list says 0.2 and −3.9 of tracks at 0 and 4: 0.2 is far more likely the first, though −3.9 is then new.
+    far = [] if sigma_m is None else [entry(500.0, of="truck", cov=(sigma_m**2, 0.0, sigma_m**2))]
+    lists = [[joined(*(entry(x, of="pedestrian") for x in xs), *far) for xs in ((0.0, 4.0), (0.2, -3.9))]]
+    found = fuse_one(reports_of(lists, ["a", "b"], [0.0, 0.01], [0.0, 0.01]), gate=0.99, **AT_ONCE)[-1]
+    here = np.sort(found["x_m"][found["x_m"] < 100.0])
+    assert here == pytest.approx([-3.9, 0.1, 4.0], abs=1e-3)
+
+
 def test_of_two_tracks_that_come_together_the_one_founded_later_ends():
     found = converging(["a", "b"])
     assert [len(one) for one in found] == [2, 2, 1, 1]
@@ -548,6 +616,17 @@ def test_many_units_do_not_split_an_object_in_two():
     assert max(counts) <= 2
     first = found[1]["track_id"][0]
     assert all(first in one["track_id"] for one in found[1:])
+
+
+def test_the_most_probable_class_is_the_first_of_equals_and_other_where_nothing_is_said():
+    other = CLASSES.index("other")
+    said = np.zeros((5, len(CLASSES)))
+    said[1, [3, other]] = 0.5
+    said[2, [3, 4]] = 0.4, 0.6
+    said[3, other] = 1e-3
+    said[4, [0, 4]] = 0.5
+    assert [most_probable(one) for one in said] == [other, 3, 4, other, 0]
+    assert most_probable_of_each(said).tolist() == [other, 3, 4, other, 0]
 
 
 def test_classes_that_agree():

@@ -8,6 +8,7 @@ from functools import cached_property
 import numba as nb
 import numpy as np
 
+from copem_replay.fusion.agree import most_probable_of_each
 from copem_replay.fusion.object_list import Entries
 from copem_replay.pem.look import Look
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
@@ -71,7 +72,7 @@ class Belief:
     def class_of(self, scene: Scene) -> Int:
         """(P,) index into CLASSES: the true one, or what the fusion takes it for."""
         if self.said is not None:
-            likely: Int = self.said["class_probability"].argmax(axis=1)
+            likely: Int = most_probable_of_each(self.said["class_probability"])
             return likely
         classes: Int = scene.object_class[self.fused.row_object_ix].astype(np.int64)
         return classes

@@ -15,7 +15,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.assignment import assign_pairs
+from copem_replay.assignment import assign_pairs, largest_around
+from copem_replay.fusion.agree import most_probable
 from copem_replay.fusion.combine import covariance_intersection, fast_covariance_intersection, floored
 from copem_replay.fusion.content_order import compare_rows, sort_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
@@ -73,7 +74,8 @@ def fuse_run(
         most, total = max(most, here), total + here
     states, class_sum = np.empty(most, _POINT), np.empty((most, len(CLASSES)))
     by_x, partner, claimed = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
-    row, col, cost = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64)
+    row, col = np.empty(most + 64, np.int64), np.empty(most + 64, np.int64)
+    cost, spread = np.empty(most + 64), np.empty(most + 64)
     lists, joining = np.empty(units, np.int64), np.empty(most, np.int64)
     start, begin = np.zeros(instants + 1, np.int64), np.zeros(total + 1, np.int64)
     member, fused = np.empty(total, np.int64), np.empty(most, entries.dtype)
@@ -82,7 +84,9 @@ def fuse_run(
         for q in range(_lists_in_order(newest[k], captured_s, arrives_s, points, first, content, lists)):
             a = first[lists[q]]
             entering = points[a : first[lists[q] + 1]]
-            row, col, cost, pairs = _allowed_pairs(entering, states, by_x[:count], agree, gate, row, col, cost)
+            row, col, cost, spread, pairs = _allowed_pairs(
+                entering, states, by_x[:count], agree, gate, row, col, cost, spread
+            )
             assign_pairs(row[:pairs], col[:pairs], cost[:pairs], len(entering), count, partner)
             for i in range(len(entering)):
                 c, point = partner[i], entering[i]
@@ -95,7 +99,7 @@ def fuse_run(
                 for h in range(len(CLASSES)):
                     class_sum[c, h] += entries[point.row].class_probability[h]
                 if states[c].kind != point.kind:
-                    states[c].kind = np.argmax(class_sum[c])
+                    states[c].kind = most_probable(class_sum[c])
                 joining[joined], claimed[joined] = a + i, c
                 joined += 1
             _sort_by_x(states, by_x[:count])
@@ -150,7 +154,7 @@ def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_exis
             point, entry = points[i], entries[rows[i]]
             point.x_m, point.y_m = entry.x_m, entry.y_m
             point.ee, point.en, point.nn = floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
-            point.kind = np.argmax(entry.class_probability)
+            point.kind = most_probable(entry.class_probability)
             point.row, point.list = rows[i], f
     return points, first
 
@@ -194,11 +198,14 @@ def _list_before(
 
 @nb.njit(cache=True, nogil=True)
 def _allowed_pairs(
-    here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float
-) -> tuple[Int, Int, Float, int]:
-    """Pairs within the gate whose classes agree: entry, cluster, cost below 0; the arrays, longer if need be."""
+    here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
+) -> tuple[Int, Int, Float, Float, int]:
+    """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component.
+
+    The arrays are those given, longer if need be.
+    """
     n = low = 0
-    widest = highest = 0.0
+    widest = 0.0
     for c in by_x:
         widest = max(widest, clusters[c].ee)
     for i in range(len(here)):
@@ -222,14 +229,15 @@ def _allowed_pairs(
             if d2 > gate:
                 continue
             if n == len(row):
-                row, col, cost = np.append(row, row), np.append(col, col), np.append(cost, cost)
-            spread = np.log(det)
-            highest = spread if n == 0 else max(highest, spread)
-            row[n], col[n], cost[n] = i, by_x[p], d2 + spread
+                row, col = np.append(row, row), np.append(col, col)
+                cost, spread = np.append(cost, cost), np.append(spread, spread)
+            volume = np.log(det)
+            row[n], col[n], cost[n], spread[n] = i, by_x[p], d2 + volume, volume
             n += 1
+    largest_around(row[:n], col[:n], spread[:n], len(here), len(by_x))
     for p in range(n):
-        cost[p] -= gate + highest + _SURPLUS
-    return row, col, cost, n
+        cost[p] -= gate + spread[p] + _SURPLUS
+    return row, col, cost, spread, n
 
 
 @nb.njit(cache=True, nogil=True)

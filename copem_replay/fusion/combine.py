@@ -19,7 +19,7 @@ from copem_replay.tracks import Bool, Float
 
 SMALLEST_VARIANCE_M2 = 1e-9
 """Eigenvalues of a measurement's covariance below this count as this (the contract's)."""
-_FLATTEST = 1e-12
+FLATTEST = 1e-12
 """No eigenvalue counts as less than this share of the other (chosen): rounding could make it negative."""
 
 
@@ -28,7 +28,7 @@ def floored(ee: float, en: float, nn: float) -> tuple[float, float, float]:
     """The covariance with the same axes whose eigenvalues are not too small."""
     middle, half = (ee + nn) / 2, math.hypot((ee - nn) / 2, en)
     high = max(middle + half, SMALLEST_VARIANCE_M2)
-    low = max(middle - half, SMALLEST_VARIANCE_M2, _FLATTEST * high)
+    low = max(middle - half, SMALLEST_VARIANCE_M2, FLATTEST * high)
     if low <= middle - half:
         return ee, en, nn
     if half == 0.0:

@@ -14,6 +14,7 @@ import numpy as np
 
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.fusion.belief import Belief
+from copem_replay.fusion.combine import FLATTEST
 from copem_replay.fusion.instants import instants
 from copem_replay.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
 
@@ -31,10 +32,9 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Bel
     at = instants(heard, max_age_s=max_age_s)
     rows, start, object_ix, instant = _contributions(heard, at.newest, without_object_ix)
     valid = _any(heard.valid, rows, start)
-    ee, en, nn = _information(heard)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     _combine_position(
-        heard.valid, heard.x_m, heard.y_m, ee, en, nn, rows, start,
+        heard.valid, heard.x_m, heard.y_m, *floored(heard), *_information(heard), rows, start,
         out["x_m"], out["y_m"], out["cov_ee_m2"], out["cov_en_m2"], out["cov_nn_m2"],
     )  # fmt: skip
     spread = {}
@@ -109,25 +109,34 @@ def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[
 
 
 def _information(heard: Tracks) -> tuple[Float, Float, Float]:
-    """Inverse position covariances ee, en, nn (1 | S, P)."""
-    high, low, c2, s2 = _axes(heard)
+    """Inverse position covariances ee, en, nn (1 | S, P), of the same eigenvalues as `floored`."""
+    high, low, c2, s2 = _axes(*_covariances(heard))
     mean, difference = (1 / high + 1 / low) / 2, (1 / high - 1 / low) / 2
     return mean + difference * c2, difference * s2, mean - difference * c2
 
 
 def floored(heard: Tracks) -> tuple[Float, Float, Float]:
-    """Position covariances ee, en, nn (1 | S, P), their eigenvalues no smaller than SMALLEST_VARIANCE."""
-    high, low, c2, s2 = _axes(heard)
+    """Position covariances ee, en, nn (1 | S, P) as stated, but no eigenvalue is too small: see combine.floored."""
+    given = _covariances(heard)
+    high, low, c2, s2 = _axes(*given)
     mean, difference = (high + low) / 2, (high - low) / 2
-    return mean + difference * c2, difference * s2, mean - difference * c2
+    wide = low <= (given[0] + given[2]) / 2 - np.hypot((given[0] - given[2]) / 2, given[1])
+    ee, en, nn = mean + difference * c2, difference * s2, mean - difference * c2
+    return np.where(wide, given[0], ee), np.where(wide, given[1], en), np.where(wide, given[2], nn)
 
 
-def _axes(heard: Tracks) -> tuple[Float, Float, Float, Float]:
-    """Eigenvalues of position covariances, floored, larger first; cos 2φ and sin 2φ of the larger one's direction φ."""
+def _covariances(heard: Tracks) -> tuple[Float, Float, Float]:
+    """Position covariances ee, en, nn (1 | S, P) as stated, 0 where they are not."""
     none = np.zeros((1, len(heard.frame_ix)))
-    a, b, d = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
+    ee, en, nn = (none if c is None else c for c in (heard.cov_ee_m2, heard.cov_en_m2, heard.cov_nn_m2))
+    return ee, en, nn
+
+
+def _axes(a: Float, b: Float, d: Float) -> tuple[Float, Float, Float, Float]:
+    """Eigenvalues of position covariances, floored, larger first; cos 2φ and sin 2φ of the larger one's direction φ."""
     half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
-    high, low = np.maximum(half + turn, SMALLEST_VARIANCE), np.maximum(half - turn, SMALLEST_VARIANCE)
+    high = np.maximum(half + turn, SMALLEST_VARIANCE)
+    low = np.maximum(half - turn, np.maximum(SMALLEST_VARIANCE, FLATTEST * high))
     c2 = np.where(turn > 0, (a - d) / 2 / np.where(turn > 0, turn, 1), 1.0)
     s2 = np.where(turn > 0, b / np.where(turn > 0, turn, 1), 0.0)
     return high, low, c2, s2
@@ -170,7 +179,8 @@ def _any_of(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def _combine_position(
-    valid: Bool, x: Float, y: Float, ee: Float, en: Float, nn: Float, rows: Int, start: Int,
+    valid: Bool, x: Float, y: Float, cov_ee: Float, cov_en: Float, cov_nn: Float,
+    ee: Float, en: Float, nn: Float, rows: Int, start: Int,
     out_x: Float, out_y: Float, out_ee: Float, out_en: Float, out_nn: Float,
 ) -> None:  # fmt: skip
     for s in range(out_x.shape[0]):
@@ -178,18 +188,21 @@ def _combine_position(
         j = s if x.shape[0] > 1 else 0
         for p in range(out_x.shape[1]):
             a = b = d = u = v = x0 = y0 = 0.0
-            n = 0
+            n, last = 0, -1
             for c in range(start[p], start[p + 1]):
                 r = rows[c]
                 if not valid[s, r]:
                     continue
                 if n == 0:  # relative to the first: weights of exact states are large
                     x0, y0 = x[j, r], y[j, r]
-                n += 1
+                n, last = n + 1, r
                 dx, dy = x[j, r] - x0, y[j, r] - y0
                 a, b, d = a + ee[i, r], b + en[i, r], d + nn[i, r]
                 u, v = u + ee[i, r] * dx + en[i, r] * dy, v + en[i, r] * dx + nn[i, r] * dy
-            if n:
+            if n == 1:  # as it is, to the last bit
+                out_ee[s, p], out_en[s, p], out_nn[s, p] = cov_ee[i, last], cov_en[i, last], cov_nn[i, last]
+                out_x[s, p], out_y[s, p] = x0, y0
+            elif n:
                 det = a * d - b * b
                 out_ee[s, p], out_en[s, p], out_nn[s, p] = d / det, -b / det, a / det
                 out_x[s, p], out_y[s, p] = x0 + (d * u - b * v) / det, y0 + (a * v - b * u) / det

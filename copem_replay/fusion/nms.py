@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.components import Positive, Share
-from copem_replay.fusion.agree import AGREE
+from copem_replay.fusion.agree import AGREE, most_probable_of_each
 from copem_replay.fusion.cluster_kernel import WIDTH
 from copem_replay.fusion.component import ListFusion
 from copem_replay.fusion.content_order import sort_rows
@@ -45,7 +45,7 @@ class Nms(ListFusion):
             bounds = run - run[0]
             entries = reports.lists.entries[run[0] : run[-1]]
             start, rows = side_by_side(bounds, reports.newest, entries["existence"] >= self.min_existence)
-            kind = np.argmax(entries["class_probability"], axis=1)
+            kind = most_probable_of_each(entries["class_probability"])
             # Closer than the sum of both reaches boxes may overlap, and centres do.
             reach_m = np.full(len(entries), self.radius_m / 2)
             if self.by == "iou":

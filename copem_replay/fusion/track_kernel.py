@@ -13,7 +13,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.assignment import assign_pairs
+from copem_replay.assignment import assign_pairs, largest_around
+from copem_replay.fusion.agree import most_probable
 from copem_replay.fusion.combine import floored
 from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
@@ -27,7 +28,6 @@ SAME_OBJECT = 1.386
 """Tracks whose next entries would be as close as this, d², can be of one object: the median of χ² with 2 degrees of
 freedom (chosen), so half of the pairs of entries of one object are closer."""
 _SAME_S = SAME_INSTANT_NS * 1e-9
-_OTHER = CLASSES.index("other")
 _LEAST_COST = 1e-6
 """What the worst pair within the gate is better than none (chosen: small against the differences between pairs)."""
 
@@ -52,7 +52,8 @@ TRACK = np.dtype(
     ]
 )  # fmt: skip
 CLAIM = np.dtype([("existence", "f8"), ("at_s", "f8")])
-"""The last thing a unit said of a track, and when; nothing yet: zeros."""
+"""The newest thing a unit said of a track, and since when that fades: its capture (`stale`: when it was heard). Nothing
+yet: 0, −inf."""
 
 
 class Memory(NamedTuple):
@@ -189,6 +190,7 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
         if track.at_s < now_s:
             predict(track.state, track.P, now_s - track.at_s, rules.q_m2ps3)
             track.at_s = now_s
+    said_s = now_s if rules.late == STALE else said.captured_s[f]
     seen = _seen(said, rules, f, now_s)
     rows = said.rows[said.start[f] : said.start[f + 1]]
     partner = _partners(memory.tracks, said, rules, rows, seen)
@@ -209,7 +211,8 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
         track.ee, track.en, track.nn = ee, en, nn
         _describe(track, entry, said.captured_s[f])
         claim = memory.claims[partner[i], said.unit_ix[f]]
-        claim.existence, claim.at_s = entry.existence, now_s
+        if said_s >= claim.at_s:
+            claim.existence, claim.at_s = entry.existence, said_s
     for j in partner:
         for k in partner:
             memory.together_s[j, k] = now_s
@@ -240,9 +243,9 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
         return partner
     class_ix = np.empty(n, np.int64)
     for i in range(n):
-        class_ix[i] = _most_probable(said.entries[rows[i]].class_probability)
-    row, col, cost = np.empty(n * m, np.int64), np.empty(n * m, np.int64), np.empty(n * m)
-    pairs, most = 0, -np.inf
+        class_ix[i] = most_probable(said.entries[rows[i]].class_probability)
+    row, col = np.empty(n * m, np.int64), np.empty(n * m, np.int64)
+    cost, spread, pairs = np.empty(n * m), np.empty(n * m), 0
     for j in range(m):
         track = tracks[j]
         agree = rules.agree[track.class_ix]
@@ -255,23 +258,16 @@ def _partners(tracks: NDArray[Any], said: Said, rules: Rules, rows: Int, seen: F
                 continue
             d2 = distance2(dx, dy, a, b, d)
             if d2 <= rules.gate:
-                log_det = math.log(a * d - b * b)
-                row[pairs], col[pairs], cost[pairs] = i, j, d2 + log_det
-                most = max(most, log_det)
+                row[pairs], col[pairs], spread[pairs] = i, j, math.log(a * d - b * b)
+                cost[pairs] = d2 + spread[pairs]
                 pairs += 1
+    row, col, cost, spread = row[:pairs], col[:pairs], cost[:pairs], spread[:pairs]
     # Alone costs 0: shifted so that any pair within the gate is better than none.
-    assign_pairs(row[:pairs], col[:pairs], cost[:pairs] - (rules.gate + most + _LEAST_COST), n, m, partner)
+    largest_around(row, col, spread, n, m)
+    for p in range(pairs):
+        cost[p] -= rules.gate + spread[p] + _LEAST_COST
+    assign_pairs(row, col, cost, n, m, partner)
     return partner
-
-
-@nb.njit(cache=True, nogil=True)
-def _most_probable(probability: Float) -> int:
-    """Index of the largest, the first of equals; `other` where nothing is said."""
-    best = _OTHER
-    for c in range(len(probability)):
-        if probability[c] > probability[best] or (probability[c] == probability[best] > 0 and c < best):
-            best = c
-    return best
 
 
 @nb.njit(cache=True, nogil=True)
@@ -282,6 +278,8 @@ def _with_room(memory: Memory, more: int) -> Memory:
     n, units = memory.claims.shape
     tracks, claims = np.zeros(n + more, TRACK), np.zeros((n + more, units), CLAIM)
     together_s = np.full((n + more, n + more), -np.inf)
+    for claim in claims[n:].flat:
+        claim.at_s = -np.inf
     tracks[:n], claims[:n], together_s[:n, :n] = memory.tracks, memory.claims, memory.together_s
     return Memory(tracks, claims, together_s)
 
@@ -304,7 +302,7 @@ def _describe(track: Any, entry: Any, captured_s: float) -> None:
     track.height_m += entry.height_m
     for c in range(len(CLASSES)):
         track.class_probability[c] += entry.class_probability[c]
-    track.class_ix = _most_probable(track.class_probability)
+    track.class_ix = most_probable(track.class_probability)
     track.count += 1
 
 

@@ -16,7 +16,7 @@ from copem_replay.fusion.object_list import ENTRY, Lists, Reports
 from copem_replay.fusion.track_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
 from copem_replay.fusion.union import run_after_run
 from copem_replay.resample import wrap
-from copem_replay.tracks import Float
+from copem_replay.tracks import Float, Int
 
 _CONTENT = ENTRY.fields["captured_s"][1] // 8 if ENTRY.fields else 0
 """So many numbers of an entry say what it is; when and whose it is stands behind them."""
@@ -29,11 +29,13 @@ class Tracker(ListFusion):
     List after list, entries are assigned to tracks at least total cost d² + ln|S|, S = P + R, where d² is within `gate`
     (the share of true pairs inside: χ², two degrees of freedom) and the classes agree; whoever is left founds a track
     of the entry's own velocity ± `speed_sigma_mps` per axis. Velocities are not measured after that. `late` says what
-    becomes of a list that shows the past: `stale`, it is taken for the present; `predict`, its entries are moved to now
-    by their own velocities, R growing by q·age³/3; `replay`, it is heard at its capture, and everything captured since
-    again: the same as if it had been in time, up to `buffer_s` back, beyond which it is ignored. What a unit last
-    claimed of a track fades with `forget_s`, existence is 1 − Π(1 − cₙe^(−age/forget)), so that it depends on time and
-    not on the rate of lists; where it is not above `drop` a track ends. It is published above `publish`, when the
+    becomes of a list that shows the past: `stale`, it is taken for the present unless a newer one of its unit is there;
+    `predict`, its entries are moved to now by their own velocities, R growing by q·age³/3; `replay`, it is heard at its
+    capture, and everything captured since again: the same as if it had been in time, up to `buffer_s` back, beyond
+    which it is ignored. What a unit last claimed of a track fades with `forget_s`, existence is
+    1 − Π(1 − cₙe^(−age/forget)), so that it depends on time and not on the rate of lists; where it is not above `drop`
+    a track ends. Ages count from capture (`stale`: from when the list was heard, as if of then), and what a unit
+    captured last is its last word, in whatever order lists come. A track is published above `publish`, when the
     captures that support it span `confirm_s`. Of two tracks as close as two entries of one object may be (d² within the
     median of χ²), which no list held both for `forget_s`, the younger ends. Yaw and height above ground are the newest
     entry's, size and class probabilities the mean of all.
@@ -68,15 +70,22 @@ class Tracker(ListFusion):
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
             self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
         )  # fmt: skip
+        arrived, start = _gone_by(reports) if self.late == "stale" else (reports.arrived, reports.arrived_start)
         runs = [
-            fuse_run(
-                _said(reports, s), rules, len(reports.units), reports.issue_s, reports.arrived, reports.arrived_start
-            )
+            fuse_run(_said(reports, s), rules, len(reports.units), reports.issue_s, arrived, start)
             for s in range(len(reports.lists.start))
         ]
         fused = run_after_run(runs, len(reports.issue_s))
         fused.entries["yaw_rad"] = wrap(fused.entries["yaw_rad"])
         return fused
+
+
+def _gone_by(reports: Reports) -> tuple[Int, Int]:
+    """What arrives, and where that of each instant begins, without what a newer list of its unit has outrun."""
+    instant = np.repeat(np.arange(len(reports.issue_s)), np.diff(reports.arrived_start))
+    kept = reports.newest[instant, reports.unit_ix[reports.arrived]] == reports.arrived
+    start = np.append(0, np.cumsum(np.bincount(instant[kept], minlength=len(reports.issue_s))))
+    return reports.arrived[kept], start.astype(np.int64)
 
 
 def _said(reports: Reports, run: int) -> Said:
