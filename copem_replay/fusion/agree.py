@@ -27,11 +27,11 @@ which, and the other one of the vehicles. Symmetric, not transitive: a car and a
 @nb.njit(cache=True, nogil=True)
 def most_probable(probability: Float) -> int:
     """Index of the largest of the probabilities `(C,)`, the first of equals; `other` where nothing is said."""
-    best = _OTHER
-    for c in range(len(probability)):
-        if probability[c] > probability[best] or (probability[c] == probability[best] > 0 and c < best):
+    best = 0
+    for c in range(1, len(probability)):
+        if probability[c] > probability[best]:
             best = c
-    return best
+    return best if probability[best] > 0 else _OTHER
 
 
 @nb.njit(cache=True, nogil=True)
