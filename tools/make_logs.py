@@ -13,7 +13,7 @@ import argparse
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,6 +35,8 @@ class Recording:
     description: str
     topics: Mapping[str, str]  # topic: what is on it
     messages: Iterable[tuple[str, Any]]  # (topic, message), in the order of their `timestamp`
+    source: str = "synthetic (tools/make_logs.py)"
+    records: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # further metadata; taken after the messages
 
 
 # What moves, and how ----------------------------------------------------------------------------------------
@@ -216,7 +218,7 @@ def _write_content(writer: Writer, recording: Recording) -> None:
         **dict.fromkeys(("min_protobuf_version", "max_protobuf_version"), protobuf_version),
         "description": recording.description,
         "authors": "copem_replay",
-        "data_sources": "synthetic (tools/make_logs.py)",
+        "data_sources": recording.source,
     }  # neither creation_time nor zero_time: the first would be a clock, and the scene has no date
     writer.add_metadata("net.asam.osi.trace", dict(sorted(trace.items())))
     prefix = "net.asam.osi.trace.channel."
@@ -234,6 +236,8 @@ def _write_content(writer: Writer, recording: Recording) -> None:
         stamp_ns = message.timestamp.seconds * NANOS_PER_SECOND + message.timestamp.nanos
         data = message.SerializeToString(deterministic=True)
         writer.add_message(channel_ids[topic], stamp_ns, data, publish_time=stamp_ns)
+    for name, record in sorted(recording.records.items()):
+        writer.add_metadata(name, dict(sorted(record.items())))
 
 
 def main() -> None:

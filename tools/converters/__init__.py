@@ -1,0 +1,1 @@
+"""Converters of public data sets and simulations to OSI truth, one module per format (docs/converters.md)."""

@@ -1,0 +1,163 @@
+"""Argoverse 2 sensor logs: a folder with annotations.feather and city_SE3_egovehicle.feather.
+
+Boxes are in the frame of the ego vehicle, whose origin is the rear axle, not the centre of the car: each is brought
+to the city frame with the ego pose of its time stamp. Quaternions are w x y z. Stamps are integer nanoseconds of the
+recording car's own clock (3.159e17: not Unix time). The columns and categories are those of av2-api (MIT). There are
+no velocities. A rider and his bicycle are two boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.feather
+
+from converters import rotate
+from converters.kinds import KINDS
+from converters.trace import Box, Frame, Report
+from copem_replay.errors import InputError
+from copem_replay.tracks import Float
+
+EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
+"""Length, width, height of the cars, Ford Fusion Hybrid; the recording `av2_3b3570b4` gives the ego this size."""
+CENTRE_FROM_REAR_AXLE_M: Final = (1.339, 0.0, 0.438)
+"""Centre of the box ahead of, left of and above the rear axle: estimate of py123d from model data and lidar points."""
+
+_EGO: Final = "EGO_VEHICLE"
+_POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_SIZE: Final = ("length_m", "width_m", "height_m")
+_KIND: Final = {
+    "ANIMAL": "animal",
+    "ARTICULATED_BUS": "bus",
+    "BICYCLE": "bicycle",
+    "BICYCLIST": "bicycle",
+    "BOLLARD": "pole",
+    "BOX_TRUCK": "truck",
+    "BUS": "bus",
+    "CONSTRUCTION_BARREL": "cone",
+    "CONSTRUCTION_CONE": "cone",
+    "DOG": "animal",
+    "LARGE_VEHICLE": "truck",
+    "MESSAGE_BOARD_TRAILER": "trailer",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "static",
+    "MOTORCYCLE": "motorcycle",
+    "MOTORCYCLIST": "motorcycle",
+    "OFFICIAL_SIGNALER": "pedestrian",
+    "PEDESTRIAN": "pedestrian",
+    "RAILED_VEHICLE": "tram",
+    "REGULAR_VEHICLE": "car",
+    "SCHOOL_BUS": "bus",
+    "SIGN": "static",
+    "STOP_SIGN": "static",
+    "STROLLER": "other",
+    "TRAFFIC_LIGHT_TRAILER": "trailer",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "tractor",
+    "VEHICULAR_TRAILER": "trailer",
+    "WHEELCHAIR": "wheelchair",
+    "WHEELED_DEVICE": "scooter",
+    "WHEELED_RIDER": "pedestrian",
+}
+
+
+def frames(
+    log: Path,
+    report: Report,
+    *,
+    ego_size_m: tuple[float, float, float] = EGO_SIZE_M,
+    centre_from_rear_axle_m: tuple[float, float, float] = CENTRE_FROM_REAR_AXLE_M,
+) -> Iterator[Frame]:
+    """All annotated instants, with the ego vehicle as host. Raises InputError."""
+    if not log.is_dir():
+        raise InputError(f"{log}: expected the folder of an Argoverse 2 sensor log, found no folder")
+    poses = _table(log / "city_SE3_egovehicle.feather", _POSE)
+    boxes = _table(log / "annotations.feather", (*_POSE, *_SIZE), ("category", "track_uuid"))
+    city_R_ego, city_t_ego = _se3(poses)
+    pose_of = {int(stamp): k for k, stamp in enumerate(poses["timestamp_ns"])}
+
+    uuids = dict.fromkeys(boxes["track_uuid"][boxes["category"] != _EGO].tolist())
+    ids = {uuid: k for k, uuid in enumerate(uuids, start=2)}
+    report.names |= {1: _EGO} | {k: uuid for uuid, k in ids.items()}
+    size, centre = "×".join(f"{v:g}" for v in ego_size_m), ", ".join(f"{v:g}" for v in centre_from_rear_axle_m)
+    report.assume(
+        f"ego vehicle: id 1, {size} m, its centre {centre} m (ahead, left, up) of the rear axle, where the log has it"
+    )
+    ego_R_object, ego_t_object = _se3(boxes)
+    for stamp_ns, rows in _by_stamp(boxes["timestamp_ns"]):
+        if (pose := pose_of.get(stamp_ns)) is None:
+            report.count("annotated instant", "without an ego pose of the same time stamp: skipped")
+            continue
+        R, t = city_R_ego[pose], city_t_ego[pose]
+        found = [_ego(R, t, ego_size_m, centre_from_rear_axle_m)]
+        for k in rows:
+            if boxes["category"][k] == _EGO:
+                report.count("row", f"of category {_EGO}: replaced by the ego pose")
+                continue
+            category = str(boxes["category"][k])
+            if category not in _KIND:
+                report.count("object state", f"of the unknown category {category}: taken as other")
+            length, width, height = (float(boxes[name][k]) for name in _SIZE)
+            found.append(
+                Box(
+                    id=ids[boxes["track_uuid"][k]],
+                    kind=KINDS[_KIND.get(category, "other")],
+                    at_m=tuple((R @ ego_t_object[k] + t).tolist()),
+                    yaw_rad=_yaw(R @ ego_R_object[k]),
+                    size_m=(length, width, height),
+                )
+            )
+        yield Frame(stamp_ns, found, host=1)
+
+
+def _ego(R: Float, t: Float, size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> Box:
+    """Return the ego vehicle at a pose of its rear axle."""
+    at_m = tuple((R @ np.array(centre_m) + t).tolist())
+    x, y, z = (-v + 0.0 for v in centre_m)
+    return Box(1, KINDS["car"], at_m, _yaw(R), size_m, rear_axle_m=(x, y, z))
+
+
+def _yaw(R: Float) -> float:
+    return float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _se3(table: dict[str, Any]) -> tuple[Float, Float]:
+    """(N, 3, 3) rotations and (N, 3) translations."""
+    R = rotate.of_quaternion(*(table[name] for name in ("qw", "qx", "qy", "qz")))
+    return R, np.stack([table[name] for name in ("tx_m", "ty_m", "tz_m")], axis=-1)
+
+
+def _by_stamp(stamps_ns: Any) -> Iterator[tuple[int, Any]]:
+    """Yield each stamp once, in order, with its rows as in the file."""
+    unique, group = np.unique(stamps_ns, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    edges = np.searchsorted(group[order], np.arange(len(unique) + 1))
+    for k, stamp_ns in enumerate(unique.tolist()):
+        yield stamp_ns, order[edges[k] : edges[k + 1]].tolist()
+
+
+def _table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return the columns that are used, (N,) each. Raises InputError."""
+    try:
+        table = pyarrow.feather.read_table(path, memory_map=False)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; an Argoverse 2 sensor log has one") from None
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{path}: expected a feather file, found {str(error).splitlines()[0]}") from None
+    expected = ("timestamp_ns", *texts, *numbers)
+    if missing := [name for name in expected if name not in table.column_names]:
+        raise InputError(f"{path}: expected the columns {', '.join(expected)}; missing: {', '.join(missing)}")
+    columns: dict[str, Any] = {}
+    for name in expected:
+        kind = pa.int64() if name == "timestamp_ns" else pa.string() if name in texts else pa.float64()
+        try:
+            column = table[name].cast(kind)
+        except pa.ArrowException:
+            raise InputError(f"{path}: column {name}: expected {kind}, found {table[name].type}") from None
+        if column.null_count:
+            raise InputError(f"{path}: column {name}: expected no gaps, found {column.null_count}")
+        columns[name] = column.to_numpy()
+    return columns

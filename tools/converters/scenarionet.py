@@ -1,0 +1,202 @@
+"""ScenarioNet scenario descriptions: one pickle with a dict of arrays, T steps long, from nuScenes and others.
+
+nuScenes, as ScenarioNet writes it: labels of 2 Hz interpolated to 10 Hz; the ego vehicle has length and width swapped
+(1.73 × 4.08 m) and its z is 0; its position is that of the rear axle on the ground (nuscenes-devkit issues 108 and
+161), not the centre; the velocity beside a step without the object is 0, whatever the object does. `valid` says which
+steps count: elsewhere there are zeros. Positions of everything else are centres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from converters import restricted_pickle
+from converters.kinds import KINDS, Kind
+from converters.parse import LAST_SECOND, numbered, shown
+from converters.rotate import wrapped
+from converters.trace import Box, Frame, Report
+from copem_replay.errors import InputError
+from copem_replay.tracks import Bool, Float
+from copem_replay.wording import counted
+
+_MOST_COLUMNS: Final = 16  # chosen; there are at most 3
+_MOST_STEPS: Final = 10_000_000  # chosen: eleven days at 10 Hz
+
+EGO_CENTRE_M: Final = 1.385
+"""Centre of nuScenes' Renault Zoe ahead of its rear axle: as in py123d, from the model's data."""
+
+_KIND_OF_NUSCENES: Final = {  # category, or what it begins with; the longest that fits
+    "animal": "animal",
+    "human.pedestrian": "pedestrian",
+    "human.pedestrian.personal_mobility": "scooter",
+    "human.pedestrian.stroller": "other",
+    "human.pedestrian.wheelchair": "wheelchair",
+    "movable_object": "static",
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "cone",
+    "static_object": "static",
+    "vehicle": "vehicle",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "work machine",
+    "vehicle.emergency.ambulance": "van",
+    "vehicle.emergency.police": "car",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+}
+_KIND_OF_METADRIVE: Final = {
+    "VEHICLE": "vehicle",
+    "PEDESTRIAN": "pedestrian",
+    "CYCLIST": "bicycle",
+    "TRAFFIC_BARRIER": "barrier",
+    "TRAFFIC_CONE": "cone",
+    "TRAFFIC_OBJECT": "static",
+    "OTHER": "other",
+}
+
+
+@dataclass(frozen=True)
+class _Track:
+    """One object, (T,) and (T, n) each."""
+
+    kind: Kind
+    valid: Bool
+    at_m: Float  # (T, 3)
+    yaw_rad: Float
+    size_m: Float  # (T, 3)
+    velocity_mps: Float  # (T, 2), NaN where it is not given
+
+
+def frames(path: Path, report: Report, *, ego_centre_m: float | None = None) -> Iterator[Frame]:
+    """All steps, with the track of `sdc_id` as host. Raises InputError.
+
+    `ego_centre_m`: of the ego's box ahead of the position given for it; None: `EGO_CENTRE_M` for nuScenes, else 0.
+    """
+    scenario = restricted_pickle.load(path)
+    metadata = _part(scenario, "metadata", dict, str(path))
+    stamps_ns = _stamps(metadata, f"{path}: metadata")
+    named = {str(name): track for name, track in _part(scenario, "tracks", dict, str(path)).items()}
+    ids = numbered(named)
+    host = None if metadata.get("sdc_id") is None else str(metadata["sdc_id"])
+    if host not in ids:
+        report.assume("no ego vehicle: " + ("no sdc_id" if host is None else f"no track {host} (sdc_id)"))
+    tracks = {
+        name: _track(track, len(stamps_ns), f"{path}: track {name}", report, ego=name == host)
+        for name, track in named.items()
+    }
+    if host in tracks:
+        if ego_centre_m is None:
+            ego_centre_m = EGO_CENTRE_M if metadata.get("dataset") == "nuscenes" else 0.0
+        if ego_centre_m:
+            report.assume(f"position of the ego vehicle ({host}): its rear axle, the centre {ego_centre_m:g} m ahead")
+            _move_ahead(tracks[host], ego_centre_m)
+    report.names |= {ids[name]: name for name in tracks}
+    for step, stamp_ns in enumerate(stamps_ns):
+        boxes = [_box(ids[name], t, step) for name, t in tracks.items() if t.valid[step]]
+        yield Frame(stamp_ns, boxes, ids.get(host) if host is not None else None)
+
+
+def _box(ident: int, track: _Track, step: int) -> Box:
+    x, y, z = track.at_m[step].tolist()
+    length, width, height = track.size_m[step].tolist()
+    vx, vy = track.velocity_mps[step].tolist()
+    yaw_rad = float(track.yaw_rad[step])
+    yaw_rad = wrapped(yaw_rad) if np.isfinite(yaw_rad) else yaw_rad
+    return Box(ident, track.kind, (x, y, z), yaw_rad, (length, width, height), (vx, vy))
+
+
+def _track(track: Any, steps: int, where: str, report: Report, *, ego: bool) -> _Track:
+    state = _part(track, "state", dict, where)
+    valid = _array(state, "valid", steps, 1, where)[:, 0] > 0.5
+    position = _array(state, "position", steps, 0, where)
+    if position.shape[1] not in (2, 3):
+        raise InputError(f"{where}: position: expected 2 or 3 columns, found {position.shape[1]}")
+    at_m = np.zeros((steps, 3))
+    at_m[:, : position.shape[1]] = position
+    size_m = np.concatenate([_array(state, name, steps, 1, where) for name in ("length", "width", "height")], axis=1)
+    if ego and (swapped := valid & (size_m[:, 0] < size_m[:, 1])).any():
+        found = "×".join(f"{v:g}" for v in size_m[swapped][0, :2])
+        report.count(
+            "state", f"of the ego vehicle with length and width swapped ({found} m): put right", int(swapped.sum())
+        )
+        size_m[swapped, :2] = size_m[swapped, 1::-1]
+    if valid.any() and not at_m[valid, 2].any():
+        report.count("track", "at z = 0 throughout: taken as the ground, the centre half a height above")
+        at_m[:, 2] = size_m[:, 2] / 2
+    velocity = np.full((steps, 2), np.nan)
+    if "velocity" in state:
+        velocity = _array(state, "velocity", steps, 0, where)[:, :2].copy()
+        beside = np.concatenate([[True], ~valid[:-1]]) | np.concatenate([~valid[1:], [True]])
+        unknown = valid & beside & ~velocity.any(axis=1)
+        report.count("state", "at the ends of tracks with velocity 0: taken as not given", int(unknown.sum()))
+        velocity[unknown] = np.nan
+    yaw_rad = _array(state, "heading", steps, 1, where)[:, 0]
+    return _Track(_kind(track, report), valid, at_m, yaw_rad, size_m, velocity)
+
+
+def _move_ahead(track: _Track, ahead_m: float) -> None:
+    """Move all positions along the heading, in place."""
+    track.at_m[:, 0] += ahead_m * np.cos(track.yaw_rad)
+    track.at_m[:, 1] += ahead_m * np.sin(track.yaw_rad)
+
+
+def _kind(track: Mapping[str, Any], report: Report) -> Kind:
+    """Go by the category of the data set where it is one of nuScenes, else by the type of MetaDrive."""
+    metadata = track.get("metadata")
+    category = str(metadata.get("type", "")) if isinstance(metadata, dict) else ""
+    parts = category.split(".")
+    for length in range(len(parts), 0, -1):
+        if name := _KIND_OF_NUSCENES.get(".".join(parts[:length])):
+            return KINDS[name]
+    if (kind := str(track.get("type"))) not in _KIND_OF_METADRIVE:
+        report.count("track", f"of the unknown type {shown(kind)}: taken as other")
+    return KINDS[_KIND_OF_METADRIVE.get(kind, "other")]
+
+
+def _stamps(metadata: Mapping[str, Any], where: str) -> list[int]:
+    """Nanoseconds of each step, from seconds; whole microseconds: they come as 0.30000000000000004 and as float32."""
+    name = next((name for name in ("ts", "timestep") if name in metadata), None)
+    if name is None:
+        raise InputError(f"{where}: expected the times of the steps in `ts`, found {', '.join(map(str, metadata))}")
+    try:
+        given = np.asarray(metadata[name])
+        times_s = given.astype(np.float64).ravel() if given.size <= _MOST_STEPS else np.empty(0)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: {name}: expected numbers, found {shown(metadata[name])}") from None
+    if not len(times_s) or not (np.isfinite(times_s).all() and (np.abs(times_s) <= LAST_SECOND).all()):
+        raise InputError(f"{where}: {name}: expected times in seconds, found {shown(metadata[name])}")
+    stamps: list[int] = (np.round(times_s * 1e6).astype(np.int64) * 1000).tolist()
+    return stamps
+
+
+def _part(whole: Any, key: str, kind: type, where: str) -> Any:
+    """Return a part of a dict. Raises InputError."""
+    if not isinstance(whole, dict) or not isinstance(whole.get(key), kind):
+        found = ", ".join(map(str, list(whole)[:8])) if isinstance(whole, dict) else type(whole).__name__
+        raise InputError(f"{where}: expected a ScenarioNet description with {key!r}, found {found}")
+    return whole[key]
+
+
+def _array(state: Mapping[str, Any], name: str, steps: int, columns: int, where: str) -> Float:
+    """(T, n) array of a state; `columns` of 0: any number of them. Raises InputError."""
+    if name not in state:
+        raise InputError(f"{where}: expected {name!r} in its state, found {', '.join(map(str, state))}")
+    try:
+        given = np.asarray(state[name])
+        most = columns or _MOST_COLUMNS
+        # Before any number is converted: an array of nothing can have any shape.
+        if given.ndim not in (1, 2) or len(given) != steps or not steps <= given.size <= steps * most:
+            raise InputError(
+                f"{where}: {name}: expected {counted(steps, 'step')} of up to {most}, as `ts` has, "
+                f"found shape {given.shape}"
+            )
+        return given.astype(np.float64).reshape(steps, -1)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: {name}: expected an array of numbers, found {shown(state[name])}") from None
