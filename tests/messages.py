@@ -1,0 +1,63 @@
+"""Messages for the tests of formats: ROS 2 ones serialised by rosbags, and what was read of them in short."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from copem_replay.formats.cdr import CdrDefinition
+from copem_replay.formats.fields import Listed
+from copem_replay.formats.shred import Texts
+from copem_replay.tracks import CLASSES, VALUES
+
+SEPARATOR = "=" * 80 + "\n"
+
+
+def defined(text: str, name: str = "p/msg/A", encoding: str = "ros2msg") -> CdrDefinition:
+    return CdrDefinition(name, encoding, text.encode())
+
+
+def serialised(text: str, message: dict[str, Any], *, little: bool = True, name: str = "p/msg/A") -> bytes:
+    """By rosbags."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, name))
+
+    def made(name: str, value: dict[str, Any]) -> Any:
+        fields = store.get_msgdef(name).fields
+        return store.types[name](**{f: filled(node, value.get(f, 0)) for f, node in fields})
+
+    def filled(node: Any, value: Any) -> Any:
+        kind, detail = int(node[0]), node[1]
+        if kind == 1:
+            return value
+        if kind == 2:
+            return made(detail, value)
+        item = detail[0]
+        if int(item[0]) == 1 and item[1][0] != "string":
+            return np.array(value, dtype={"byte": "u1", "char": "u1"}.get(item[1][0], item[1][0]))
+        return [filled(item, v) for v in value]
+
+    return bytes(store.serialize_cdr(made(name, message), name, little_endian=little))
+
+
+def texts(column: Texts) -> list[str | None]:
+    return [column.words[k] if k >= 0 else None for k in column.code]
+
+
+def values(found: Listed, name: str) -> list[Any]:
+    column = found.columns.values[:, VALUES.index(name)]
+    return [None if math.isnan(v) else pytest.approx(v) for v in column]
+
+
+def classes(found: Listed) -> list[str]:
+    return [CLASSES[k] for k in found.columns.class_ix]
+
+
+def ids(found: Listed) -> list[str]:
+    return [found.columns.object_ids[k] for k in found.columns.object_ix]
+
+
+def quaternion(yaw: float, scale: float = 1.0) -> dict[str, float]:
+    return {"x": 0.0, "y": 0.0, "z": scale * math.sin(yaw / 2), "w": scale * math.cos(yaw / 2)}
