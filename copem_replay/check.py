@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from copem_replay.errors import RecordingError
-from copem_replay.experiment import Carriers, Experiment
+from copem_replay.experiment import Carriers, Experiment, ReadFields
 from copem_replay.experiment_file import Source, is_there, log_paths, parse
 from copem_replay.plain_yaml import Key
 from copem_replay.read import Recording, moving_ids, read
@@ -92,22 +92,25 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
         return None, [Refused(path, "its path is not UTF-8: results could not name it")]
     ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
     wrong: list[Refused] = []
+    fields = experiment.read if isinstance(experiment.read, ReadFields) else None
     beside = {asked.topic for asked in experiment.recorded.values()}
     try:
-        recording = read(path, name=path.stem, ego=ego, topic=experiment.read.topic, beside=beside)
+        recording = read(path, name=path.stem, ego=ego, topic=experiment.read.topic, fields=fields, beside=beside)
     except RecordingError as error:
         reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
         if not reasons[0].startswith("ego: "):
             key = ("read", "topic") if "no true objects on topic" in reasons[0] else None
             return None, [Refused(path, reason, key) for reason in reasons]
         wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
-        recording = read(path, name=path.stem, topic=experiment.read.topic, beside=beside)  # for what else is wrong
+        recording = read(
+            path, name=path.stem, topic=experiment.read.topic, fields=fields, beside=beside
+        )  # for what else is wrong
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
     lists, notes = {}, list(recording.notes)
     for name, asked in experiment.recorded.items():
         try:
-            lists[name], said = recorded_unit(path, recording.scene, name, asked)
+            lists[name], said = recorded_unit(path, recording.scene, name, asked, recording.around)
             notes += said
         except RecordingError as error:
             at = ("units", name, "recorded")
@@ -128,6 +131,8 @@ def against_log(
             f"no ego vehicle in this log{_host(recording)}; give `ego: <object id>` or --ego ID "
             f"({moving_ids(scene)}), or `ego: none` with `distance_to: <unit>`",
         )
+    if experiment.braking is not None and not none and not scene.ego_sized:
+        yield ("braking",), "nobody says how large the ego is; give `ego: {topic: …, size_m: [length, width, height]}`"
     studied = not none or experiment.ego != NO_EGO  # an ego that is sought and not there is said once
     if not studied and experiment.measure.distance_to == "ego":
         yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"

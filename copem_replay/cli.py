@@ -71,6 +71,26 @@ def info(
 
 
 @app.command()
+def init(log: Annotated[Path, typer.Argument(metavar="LOG", help="Recording (MCAP).")]) -> int:
+    """Print an experiment that replays a recording, with comments: copem-replay init LOG > experiment.yaml.
+
+    Its paths are relative to where you are. Ends 2 when no list of true objects could be read.
+    """
+    from copem_replay.info import survey
+    from copem_replay.init import commented
+
+    found = survey(log)
+    if not found["readable"]:
+        raise InputError(found["reason"])
+    try:
+        str(log).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{log}: its path is not UTF-8: no experiment could name it") from None
+    print(commented(found), end="")
+    return 0
+
+
+@app.command()
 def check(
     experiment: ExperimentFile,
     log: Annotated[list[Path] | None, typer.Option(help="Check against this recording instead of those named.")] = None,

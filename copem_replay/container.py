@@ -6,27 +6,25 @@ cut off, a checksum that fails) is read from start to end, as far as it goes.
 
 from __future__ import annotations
 
-import os
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import zstandard
 from mcap.exceptions import EndOfFile
-from mcap.reader import SeekingReader
 from mcap.records import Message
 from mcap.stream_reader import CRCValidationError
 from mcap.summary import Summary
 
+from copem_replay.chunks import DAMAGE, MAGIC, without_trace
 from copem_replay.errors import RecordingError
-from copem_replay.salvage import DAMAGE, MAGIC, RECORD_LIMIT_BYTES, FromStart
+from copem_replay.indexed import in_order, summary_of
+from copem_replay.salvage import FromStart
 
 _LFS_POINTER = b"version https://git-lfs"
-_FOOTER_BYTES = 20  # summary_start, summary_offset_start, summary_crc
 
 
 @dataclass(frozen=True)
@@ -39,6 +37,8 @@ class Channel:
     encoding: str  # of the messages
     messages: int  # that can be read
     expected: int | None = None  # of a damaged file: how many its index promises, where that is known
+    schema_encoding: str = ""
+    schema_data: bytes = field(default=b"", repr=False)
 
 
 class BrokenIndexError(Exception):
@@ -65,11 +65,26 @@ class Log:
 
         By log time through the index, else as in the file, up to the damage. Raises BrokenIndexError.
         """
-        topics = {c.topic for c in self.channels if c.number in numbers}
         with open_file(self.path) as file:
-            for message in _by_index(file, topics) if self.indexed else FromStart(file):
+            for message in self._by_index(file, numbers) if self.indexed else FromStart(file):
                 if isinstance(message, Message) and message.channel_id in numbers:
                     yield message.channel_id, message.log_time, message.data
+
+    def _by_index(self, file: IO[bytes], numbers: frozenset[int]) -> Iterator[Message]:
+        """Messages in order of log time. Raises BrokenIndexError, also where there are not as many as promised."""
+        promised = sum(c.messages for c in self.channels if c.number in numbers)
+        found = 0
+        try:
+            summary = summary_of(file)
+            if summary is None:
+                raise ValueError("the index is gone")
+            for message in in_order(file, summary, numbers):
+                found += 1
+                yield message
+            if found != promised:
+                raise ValueError(f"the index promises {promised} messages, and there are {found}")
+        except DAMAGE as error:
+            raise BrokenIndexError from without_trace(error)
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -89,10 +104,8 @@ def open_log(path: Path) -> Log:
     with open_file(path) as file:
         _check_magic(path, file)
         try:
-            reader = SeekingReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
-            summary = reader.get_summary()
+            summary = summary_of(file)
             if summary is not None and _index_is_sound(summary):
-                _check_summary(file)
                 return Log(path, _channels_of(summary), indexed=True)
         except DAMAGE as error:
             return from_start(path, error)
@@ -113,14 +126,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
                 counts[record.channel_id] += 1
     expected = {c.number: c.messages for c in promised}
     channels = tuple(
-        Channel(
-            number=number,
-            topic=channel.topic,
-            schema=stream.schemas[channel.schema_id].name if channel.schema_id in stream.schemas else "",
-            encoding=channel.message_encoding,
-            messages=counts[number],
-            expected=expected.get(number),
-        )
+        _channel(number, channel, stream.schemas.get(channel.schema_id), counts[number], expected.get(number))
         for number, channel in sorted(stream.channels.items())
     )
     error = stream.error or index_error
@@ -141,16 +147,6 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, zstandard.ZstdError | RuntimeError):
         return f"a chunk cannot be decompressed: {error}"
     return f"{error}" if str(error) and not isinstance(error, KeyError) else f"{type(error).__name__} {error}".strip()
-
-
-def _by_index(file: IO[bytes], topics: set[str]) -> Iterator[Message]:
-    """Messages in order of log time. Raises BrokenIndexError."""
-    reader = SeekingReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
-    try:
-        for _, _, message in reader.iter_messages(topics=topics):
-            yield message
-    except DAMAGE as error:
-        raise BrokenIndexError from error
 
 
 def _check_magic(path: Path, file: IO[bytes]) -> None:
@@ -176,25 +172,22 @@ def _index_is_sound(summary: Summary) -> bool:
     )
 
 
-def _check_summary(file: IO[bytes]) -> None:
-    """Check the summary, as mcap does not (MCAP specification, Footer). Raises ValueError."""
-    end = file.seek(0, os.SEEK_END) - len(MAGIC)
-    file.seek(end - _FOOTER_BYTES)
-    start, _, crc = struct.unpack("<QQI", file.read(_FOOTER_BYTES))
-    file.seek(start)
-    if crc and zlib.crc32(file.read(end - 4 - start)) != crc:
-        raise ValueError("the checksum of the index fails")
-
-
 def _channels_of(summary: Summary) -> tuple[Channel, ...]:
     counts = summary.statistics.channel_message_counts if summary.statistics else {}
     return tuple(
-        Channel(
-            number=number,
-            topic=channel.topic,
-            schema=summary.schemas[channel.schema_id].name if channel.schema_id else "",
-            encoding=channel.message_encoding,
-            messages=counts.get(number, 0),
-        )
+        _channel(number, channel, summary.schemas.get(channel.schema_id), counts.get(number, 0))
         for number, channel in sorted(summary.channels.items())
+    )
+
+
+def _channel(number: int, channel: Any, schema: Any, messages: int, expected: int | None = None) -> Channel:
+    return Channel(
+        number=number,
+        topic=channel.topic,
+        schema=schema.name if schema is not None else "",
+        encoding=channel.message_encoding,
+        messages=messages,
+        expected=expected,
+        schema_encoding=schema.encoding if schema is not None else "",
+        schema_data=schema.data if schema is not None else b"",
     )

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from copem_replay.wording import printable
+
 
 class CopemError(Exception):
     """Base of all errors that are not defects.
@@ -21,7 +23,8 @@ class CopemError(Exception):
     """
 
     def __init__(self, problems: str | Sequence[str]) -> None:
-        self.problems: tuple[str, ...] = (problems,) if isinstance(problems, str) else tuple(problems)
+        lines = (problems,) if isinstance(problems, str) else problems
+        self.problems: tuple[str, ...] = tuple(printable(line) for line in lines)
         super().__init__("\n".join(self.problems))
 
 

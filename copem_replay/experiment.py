@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag,
 
 from copem_replay.braking.driver import DRIVERS, Driver
 from copem_replay.components import Count, Frozen, Id, NotNegative, Number, Positive, Share, Slot
+from copem_replay.formats.fields import Fields
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.component import Fusion, Ideal
 from copem_replay.measure_keys import Margin, Measure
@@ -194,6 +195,40 @@ class Read(Frozen):
     topic: str | None = None
 
 
+class ReadFields(Fields):
+    """How the truth is read from a topic of a schema that is not known by name: which of its fields are what."""
+
+    topic: Annotated[str, Field(min_length=1)]
+
+
+def _how_read(value: object) -> str:
+    named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
+    return "fields" if named else "topic"
+
+
+HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
+
+
+class EgoTopic(Frozen):
+    """An ego that is no object of any list: its poses are on a topic (odometry, stamped poses, transforms).
+
+    `size_m`: length, width, height. `centre_from_rear_axle_m`: how far ahead of its poses, which are on the ground, the
+    centre of its box is. `frame`: whose poses, where the topic has those of several.
+    """
+
+    topic: Annotated[str, Field(min_length=1)]
+    size_m: tuple[Positive, Positive, Positive] | None = None
+    centre_from_rear_axle_m: Number | None = None
+    frame: str | None = None
+
+
+def _what_ego(value: object) -> str:
+    return "topic" if isinstance(value, dict | EgoTopic) else "id"
+
+
+Ego = Annotated[Annotated[Id, Tag("id")] | Annotated[EgoTopic, Tag("topic")], Discriminator(_what_ego)]
+
+
 class Show(Frozen):
     """Which logs, run and configurations (by default all) are written to MCAP and .rrd; `run: null` writes none."""
 
@@ -207,8 +242,8 @@ class Experiment(Frozen):
 
     version: Annotated[Literal[1], BeforeValidator(_version)]
     logs: Annotated[tuple[str, ...], Field(min_length=1)]
-    read: Read = Read()
-    ego: Id | None = None
+    read: HowRead = Read()
+    ego: Ego | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1
     seed: Annotated[int, Field(strict=True)] = 0

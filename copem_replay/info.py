@@ -1,27 +1,35 @@
-"""What is in a recording, as data (`survey`) and as lines of text (`describe`)."""
+"""What is in a recording, as data (`survey`) and as lines of text (`describe`), and the experiment to begin with."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from copem_replay import container
-from copem_replay.container import Channel
+from copem_replay.container import Channel, Log
 from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
-from copem_replay.read import Recording, choose_topic, is_truth, moving_ids, read_log, truth_topics
+from copem_replay.init import short
+from copem_replay.read import Recording, choose_topic, foreign, is_truth, moving_ids, read_log, truth_topics
 from copem_replay.repair import MAX_GAP_S
+from copem_replay.suggest import suggestion
 from copem_replay.tracks import CLASSES, Bool, Float, Scene
-from copem_replay.wording import counted
+from copem_replay.wording import counted, printable
+
+if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
+    from copem_replay.lists import RecordedLists
 
 _ROLES = {
     "truth": "the truth",
     "unit": "lists of a unit, for `recorded: {topic: …}`",
-    "unread": "not read by this version",
+    "poses": "poses",
+    "unread": "not read",
 }
+_OURS = "copem/"  # what this project wrote beside a recording
 _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"
 
 
@@ -33,51 +41,112 @@ def survey(path: Path | str) -> dict[str, Any]:
     choice to make (then `choice` says so). A bad recording raises nothing.
     """
     found: dict[str, Any] = {"recording": Path(path).name, "readable": False, "reason": None, "choice": None}
-    found |= {"damage": None, "topics": [], "truth": []}  # damage: of the file, what is wrong with it
+    # damage: of the file, what is wrong with it
+    found |= {"damage": None, "topics": [], "truth": [], "log": str(path), "experiment": None}
     try:
         log = container.open_log(Path(path))
     except RecordingError as error:
         return found | {"reason": str(error)}
-    found |= {"damage": log.damage, "topics": [_topic(c) for c in log.channels]}
+    found |= {"damage": log.damage, "topics": _topics(log)}
     try:
         topics = [choose_topic(log)[0]]
     except RecordingError as error:
         topics = list(truth_topics(log))
         found["choice" if topics else "reason"] = str(error)
     failures = []
+    beside = [t["topic"] for t in found["topics"] if t["role"] == "unit"]
     for topic in topics:
         try:
-            found["truth"].append(_truth(read_log(log, name=Path(path).stem, topic=topic)))
+            recording = read_log(log, name=Path(path).stem, topic=topic, beside=beside)
         except RecordingError as error:
             failures.append(str(error))
+            continue
+        found["truth"].append(_truth(log, recording, found["topics"]))
     if failures and not found["truth"]:
         found["reason"] = "; ".join(failures)
     damage = next((t["damage"] for t in found["truth"] if t["damage"]), found["damage"])
-    return found | {"readable": bool(found["truth"]), "damage": damage}
+    found |= {"readable": bool(found["truth"]), "damage": damage}
+    return found | {"experiment": "\n".join(short(found)) + "\n" if found["readable"] else None}
 
 
 def describe(survey: dict[str, Any]) -> list[str]:
     """Say in lines of plain text what `survey` found. Why it found no truth is left to `reason`."""
-    lines: list[str] = [survey["recording"], *_topic_lines(survey["topics"])]
+    lines: list[str] = [survey["recording"], *_topic_lines(survey)]
     for truth in survey["truth"]:
         lines += _truth_lines(truth)
-    return lines + ([survey["choice"]] if survey["choice"] else [])
+    lines += [survey["choice"]] if survey["choice"] else []
+    if survey["experiment"]:
+        lines.append(f"experiment; with comments: copem-replay init {shlex.quote(survey['log'])} > experiment.yaml")
+        lines += [f"  {line}" for line in survey["experiment"].splitlines()]
+    return [printable(line) for line in lines]
 
 
-def _topic(channel: Channel) -> dict[str, Any]:
-    role = "truth" if is_truth(channel) else "unit" if channel.schema == osi.SENSOR_DATA else "unread"
-    return {
-        "topic": channel.topic,
-        "schema": channel.schema,
-        "encoding": channel.encoding,
-        "messages": channel.messages,
-        "role": role,
-    }
+def _topics(log: Log) -> list[dict[str, Any]]:
+    """The channels, and what each is to us."""
+    truths = truth_topics(log)
+    lists, poses = set[int](), set[int]()
+    if foreign(log):
+        from copem_replay.formats.known import is_list
+        from copem_replay.formats.poses import is_pose
+
+        lists = {c.number for c in log.channels if is_list(c)}
+        poses = {c.number for c in log.channels if is_pose(c)}
+
+    def role(channel: Channel) -> str:
+        if is_truth(channel) or (channel.topic in truths and channel.number in lists):
+            return "truth"
+        if channel.number in lists or (channel.schema == osi.SENSOR_DATA and channel.encoding == "protobuf"):
+            return "unit"
+        return "poses" if channel.number in poses else "unread"
+
+    return [
+        {
+            "topic": channel.topic,
+            "schema": channel.schema,
+            "encoding": channel.encoding,
+            "messages": channel.messages,
+            "role": role(channel),
+        }
+        for channel in log.channels
+    ]
 
 
-def _truth(recording: Recording) -> dict[str, Any]:
-    """One list of true objects."""
+def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """The lists of each unit, or what is wrong with them: `problem`."""
+    osis = {c.topic for c in log.channels if c.schema == osi.SENSOR_DATA}
+    for topic in dict.fromkeys(topics):
+        said: dict[str, Any] = {"topic": topic, "lists": 0, "entries": 0}
+        said |= {"covariances_said": False, "captures_said": False, "problem": None}
+        try:
+            found = _lists(recording, topic, of_osi=topic in osis)
+        except RecordingError as error:
+            yield said | {"problem": str(error).removeprefix(f"{recording.path}: ").removeprefix(f"{topic}: ")}
+            continue
+        said |= {"lists": len(found.tracks.stamp_ns), "entries": len(found.tracks.frame_ix)}
+        said |= {"covariances_said": bool(found.spread_said.all()), "captures_said": bool(found.capture_said.all())}
+        yield said | {"problem": None if said["lists"] else "holds no list"}
+
+
+def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:
+    """As a recorded unit has them. Raises RecordingError."""
+    if of_osi:
+        from copem_replay.lists import read_recorded
+
+        return read_recorded(recording.path, topic, recording.scene)
+    from copem_replay.unit_lists import read_listed
+
+    found = read_listed(recording.path, topic, recording.scene, recording.around)
+    if found is None:
+        raise RecordingError(f"{topic}: holds no list")
+    return found
+
+
+def _truth(log: Log, recording: Recording, topics: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One list of true objects, and what the other topics are to it."""
     scene, truth = recording.scene, recording.truth
+    poses = [t["topic"] for t in topics if t["role"] == "poses" and t["messages"]]
+    units = [t["topic"] for t in topics if t["role"] == "unit" and t["messages"]]
+    units = [name for name in units if name != recording.topic and not name.startswith(_OURS)]
     between_s = np.diff(truth.stamp_ns) * 1e-9
     longest = int(between_s.argmax()) if len(between_s) else 0
     inside_s = np.diff(truth.row_captured_s)[np.diff(truth.track_ix) == 0]
@@ -97,9 +166,12 @@ def _truth(recording: Recording) -> dict[str, Any]:
         "stationary": _by_class(scene, ~scene.moving),
         "host_id": recording.host_id,
         "ego": _ego(recording),
-        "missing": _missing(recording),
+        "missing": _missing(recording, poses),
         "damage": recording.damage,
         "notes": list(recording.notes),
+        "vehicles": moving_ids(scene, shown=6),
+        "units": list(_units(log, recording, units)),
+        "suggested": suggestion(log, recording),
     }
 
 
@@ -128,25 +200,48 @@ def _ego(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _missing(recording: Recording) -> list[str]:
-    """Say what a user may have to give."""
+def _missing(recording: Recording, poses: Sequence[str]) -> list[str]:
+    """Say what a user may have to give; `poses`: topics that may have the ego's."""
     scene = recording.scene
     if scene.ego_ix >= 0:
         return []
     host = recording.host_id
     who = "the log names no host vehicle" if host is None else f"the host vehicle {host} is no moving object"
-    return [f"no ego vehicle: {who}; {_EGO_HINT}, of {moving_ids(scene, shown=6)}"]
+    line = f"no ego vehicle: {who}; {_EGO_HINT}, of {moving_ids(scene, shown=6)}"
+    if poses:
+        line += f"; or `ego: {{topic: {poses[0]}}}` (poses are on {', '.join(poses)})"
+    return [line]
 
 
-def _topic_lines(topics: Sequence[dict[str, Any]]) -> list[str]:
+def _topic_lines(survey: dict[str, Any]) -> list[str]:
     """Tabulate the topics."""
     rows = [("topic", "schema", "encoding", "messages", "")]
     rows += [
-        (t["topic"], t["schema"] or "-", t["encoding"] or "-", str(t["messages"]), _ROLES[t["role"]]) for t in topics
+        (
+            printable(t["topic"]),
+            printable(t["schema"]) or "-",
+            printable(t["encoding"]) or "-",
+            str(t["messages"]),
+            _said(t, survey),
+        )
+        for t in survey["topics"]
     ]
     a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))
     table = [f"  {w:<{a}}  {x:<{b}}  {y:<{c}}  {z:>{d}}  {role}".rstrip() for w, x, y, z, role in rows]
-    return table if topics else []
+    return table if survey["topics"] else []
+
+
+def _said(topic: dict[str, Any], survey: dict[str, Any]) -> str:
+    """What a topic is, in words."""
+    role = topic["role"]
+    if role == "truth" and survey["choice"]:
+        return "may be the truth: `read: {topic: …}`"
+    if role == "truth" and survey["truth"] and topic["topic"] != survey["truth"][0]["topic"]:
+        return "truth, too, but not taken"
+    egos = [truth["suggested"]["ego"] for truth in survey["truth"]]
+    if role == "poses" and any(isinstance(ego, dict) and ego["topic"] == topic["topic"] for ego in egos):
+        return "poses, of the ego it seems"
+    return _ROLES[role]
 
 
 def _truth_lines(truth: dict[str, Any]) -> list[str]:
@@ -167,5 +262,13 @@ def _truth_lines(truth: dict[str, Any]) -> list[str]:
     if ego := truth["ego"]:
         size = " × ".join(f"{side:.2f}" for side in ego["size_m"])
         lines.append(f"  ego: {ego['id']} ({ego['class']}, {size} m), {ego['from_s']:.3f} – {ego['to_s']:.3f} s")
+    for unit in truth["units"]:
+        if unit["problem"]:
+            lines.append(f"  unit {unit['topic']}: {unit['problem']}")
+            continue
+        unsaid = [] if unit["covariances_said"] else ["no covariances"]
+        unsaid += [] if unit["captures_said"] else ["not when captured"]
+        said = f"{counted(unit['lists'], 'list')}, {counted(unit['entries'], 'entry', 'entries')}"
+        lines.append(f"  unit {unit['topic']}: {said}" + (f"; says {' and '.join(unsaid)}" if unsaid else ""))
     lines += [f"  missing: {line}" for line in truth["missing"]]
     return lines + [f"  note: {line}" for line in truth["notes"]]

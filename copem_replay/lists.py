@@ -17,6 +17,7 @@ from google.protobuf.message import DecodeError
 from copem_replay import container
 from copem_replay.errors import RecordingError
 from copem_replay.formats import detail, osi, sensor_data
+from copem_replay.formats.columns import LAST_NS
 from copem_replay.resample import wrap
 from copem_replay.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 
@@ -65,6 +66,7 @@ class RecordedLists:
     dropped: int  # entries that had no place
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def read_recorded(path: Path, topic: str, scene: Scene) -> RecordedLists:
     """The lists on `topic` with all they say, but ids of the truth. Raises RecordingError as `read_lists`."""
     rows, _ = _all_rows(path, topic)
@@ -84,7 +86,7 @@ def read_recorded(path: Path, topic: str, scene: Scene) -> RecordedLists:
             probability[p, index] += share
     none = probability.sum(axis=1) <= 0
     probability[none, osi.OTHER] = 1.0
-    tracks = _as_tracks(
+    tracks = as_tracks(
         topic,
         scene,
         stamps[by_time],
@@ -132,6 +134,8 @@ def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, An
             except DecodeError as error:
                 raise RecordingError(f"{log.path}: {topic}: a message cannot be decoded: {error}") from None
             _add(rows, message, log_time_ns)
+            if max(map(abs, rows.stamps[-1])) > LAST_NS:
+                raise RecordingError(f"{log.path}: {topic}: a message has an impossible time stamp")
     return rows, details
 
 
@@ -232,10 +236,10 @@ def _tracks(rows: _Rows, details: dict[int, dict[str, Any]], topic: str, scene: 
         if item is not None:
             variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
     start = np.append(first, len(order))
-    return _as_tracks(topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances)
+    return as_tracks(topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances)
 
 
-def _as_tracks(
+def as_tracks(
     topic: str, scene: Scene, stamps: Int, start: Int, object_ix: Int, frame_ix: Int, values: Float, variances: Float
 ) -> Tracks:
     """Tracks of one unit: `stamps (F, 2)` captured and arriving, `start (E + 1,)`, `object_ix (E,)`, rows (P,)."""

@@ -170,7 +170,9 @@ def distances(
     ego = reference_at(scene, truth, experiment, unique["time"])
     at, present = states_at(truth, unique["object"], unique["time"], t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     distance = np.where(present & ego.present, np.hypot(at["x_m"] - ego.x_m, at["y_m"] - ego.y_m), np.nan)
-    distance_m[known], gap_m[known] = distance[back], box_gap(at, ego, present & ego.present)[back]
+    distance_m[known] = distance[back]
+    if scene.ego_sized or experiment.measure.distance_to != "ego":
+        gap_m[known] = box_gap(at, ego, present & ego.present)[back]
     return distance_m, gap_m
 
 

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import IO
 
-from mcap.reader import SeekingReader
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import Writer
 
+from copem_replay.chunks import DAMAGE, MAGIC, parsed, record_at
 from copem_replay.container import open_file, open_log
-from copem_replay.salvage import DAMAGE, RECORD_LIMIT_BYTES, FromStart
+from copem_replay.indexed import in_order, summary_of
+from copem_replay.salvage import FromStart
 
 
 class Catalogue:
@@ -66,17 +67,28 @@ class Original:
         """Whether the file can be copied through its index: all of it is read once, for only that tells."""
         try:
             with open_file(self._path) as file:
-                reader = _reader(file)
-                self.profile = reader.get_header().profile
-                summary = reader.get_summary()
-                self.metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-                self._attachments = list(reader.iter_attachments())
-                for _message in reader.iter_messages():
+                summary = summary_of(file)
+                if summary is None:
+                    return False
+                header = parsed(Opcode.HEADER, record_at(file, len(MAGIC), Opcode.HEADER))
+                metadata = [
+                    parsed(Opcode.METADATA, record_at(file, index.offset, Opcode.METADATA))
+                    for index in summary.metadata_indexes
+                ]
+                attachments = [
+                    parsed(Opcode.ATTACHMENT, record_at(file, index.offset, Opcode.ATTACHMENT))
+                    for index in summary.attachment_indexes
+                ]
+                for _message in in_order(file, summary, summary.channels.keys()):
                     pass
         except DAMAGE:
             return False
-        if summary is None:
-            return False
+        self.profile = header.profile if isinstance(header, Header) else ""
+        self.metadata = {}
+        for record in metadata:  # rosbag2 writes one name several times
+            if isinstance(record, Metadata):
+                self.metadata.setdefault(record.name, {}).update(record.metadata)
+        self._attachments = [record for record in attachments if isinstance(record, Attachment)]
         self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
         return True
 
@@ -120,13 +132,9 @@ class Original:
             yield from (_moved(m, numbers) for m in self._salvaged if m.channel_id in numbers)
             return
         with open_file(self._path) as file:
-            for _schema, _channel, message in _reader(file).iter_messages():
-                if message.channel_id in numbers:
-                    yield _moved(message, numbers)
-
-
-def _reader(file: IO[bytes]) -> SeekingReader:
-    return SeekingReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
+            summary = summary_of(file)
+            for message in in_order(file, summary, numbers.keys()) if summary is not None else ():
+                yield _moved(message, numbers)
 
 
 def _moved(message: Message, numbers: dict[int, int]) -> Message:

@@ -20,10 +20,13 @@ from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
 from copem_replay.formats.columns import Columns
 from copem_replay.tracks import CLASSES, Scene, Tracks
-from copem_replay.wording import counted
+from copem_replay.wording import counted, printable
 
-if TYPE_CHECKING:  # it imports much that a look at a recording does not need
+if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
+    from copem_replay.experiment import EgoTopic
+    from copem_replay.formats.fields import Fields
     from copem_replay.lists import RecordedLists
+    from copem_replay.topics import Surroundings
 
 _SHOWN = 12  # ids named in an error (chosen)
 
@@ -44,31 +47,49 @@ class Recording:
     host_id: str | None
     damage: str | None = None  # what is wrong with the file and how far it could be read; among the notes, too
     lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
+    around: Surroundings | None = None  # frames of reference, where lists other than OSI's are read
+    encoding: str = "protobuf"  # of the messages of the truth
+    world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
 
 
 def read(
-    path: Path | str, *, name: str, ego: str | None = None, topic: str | None = None, beside: Collection[str] = ()
+    path: Path | str,
+    *,
+    name: str,
+    ego: str | EgoTopic | None = None,
+    topic: str | None = None,
+    fields: Fields | None = None,
+    beside: Collection[str] = (),
 ) -> Recording:
     """Read the truth of the recording at `path`, as the log called `name`.
 
-    `ego`: id of the ego vehicle, None for the host vehicle the log names. `topic`: where the truth is, None
-    where there is only one candidate. `beside`: topics that somebody else reads.
-    Raises RecordingError, one line: no such file, no MCAP file, no truth,
-    no usable object, no such ego, no such topic, or several.
+    `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
+    odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
+    have what, None where that is known. `beside`: topics that somebody else reads.
+    Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
+    or several.
     """
-    return read_log(container.open_log(Path(path)), name=name, ego=ego, topic=topic, beside=beside)
+    return read_log(container.open_log(Path(path)), name=name, ego=ego, topic=topic, fields=fields, beside=beside)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
 def read_log(
-    log: Log, *, name: str, ego: str | None = None, topic: str | None = None, beside: Collection[str] = ()
+    log: Log,
+    *,
+    name: str,
+    ego: str | EgoTopic | None = None,
+    topic: str | None = None,
+    fields: Fields | None = None,
+    beside: Collection[str] = (),
 ) -> Recording:
     """Do the same with a log that was opened before."""
-    topic, ignored = choose_topic(log, topic, beside)
+    asked = None if isinstance(ego, str) else ego
+    topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:
-        columns = _decode(log, topic)
+        columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     except container.BrokenIndexError as error:
         log = container.from_start(log.path, error.__cause__, log.channels)
-        columns = _decode(log, topic)
+        columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     scene, truth, found = assemble(columns, name)
     notes = [*columns.notes, *found]
     if scene is None or truth is None:
@@ -77,10 +98,16 @@ def read_log(
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
         raise RecordingError(f"{log.path}: {topic}: no usable object in {counted(read_messages, 'message')}{why}")
     host, said = _host(columns.hosts)
-    ego_ix, more = _ego(log.path, scene, ego, host)
+    ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _damage(log, topic, scene.end_s)
     notes = [*([damage] if damage else []), *ignored, *notes, *said, *more]
-    return Recording(replace(scene, ego_ix=ego_ix), truth, log.path, topic, tuple(notes), host, damage)
+    sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
+    scene = replace(scene, ego_ix=ego_ix, ego_sized=sized)
+    said_all = tuple(printable(note) for note in notes)
+    encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
+    return Recording(
+        scene, truth, log.path, topic, said_all, host, damage, around=around, encoding=encoding, world=world
+    )
 
 
 def is_truth(channel: Channel) -> bool:
@@ -89,19 +116,50 @@ def is_truth(channel: Channel) -> bool:
 
 
 def truth_topics(log: Log) -> dict[str, str]:
-    """Topics with at least one message of the truth, and their schema."""
-    return {c.topic: c.schema for c in log.channels if is_truth(c) and c.messages}
+    """Topics with at least one message of the truth, and their schema: OSI's, else other lists of objects with ids."""
+    osis = {c.topic: c.schema for c in log.channels if is_truth(c) and c.messages}
+    ours = {c.topic for c in log.channels if c.topic.startswith("copem/")}
+    if osis or not foreign(log):
+        return osis
+    from copem_replay.formats.known import names_objects
+    from copem_replay.topics import known_lists
+
+    others = {c.topic: c.schema for c in known_lists(log) if names_objects(c)}
+    return {t: schema for t, schema in others.items() if t not in ours} or others
 
 
-def choose_topic(log: Log, topic: str | None = None, beside: Collection[str] = ()) -> tuple[str, list[str]]:
+def foreign(log: Log) -> list[Channel]:
+    """Channels with messages that are not OSI's."""
+    return [c for c in log.channels if c.messages and not c.schema.startswith("osi3.")]
+
+
+def choose_topic(
+    log: Log,
+    topic: str | None = None,
+    beside: Collection[str] = (),
+    fields: Fields | None = None,
+    asked: EgoTopic | None = None,
+) -> tuple[str, list[str]]:
     """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
     if not any(c.messages for c in log.channels):
         raise RecordingError(f"{log.path}: holds no message ({_listed(log.channels) or 'and no channel'})")
     topics = truth_topics(log)
+    if topic is not None and foreign(log):
+        from copem_replay.topics import known_lists
+
+        topics |= {c.topic: c.schema for c in known_lists(log) if c.topic == topic}
+    if fields is not None:
+        topics = {c.topic: c.schema for c in log.channels if c.messages}
+        if topic not in topics:
+            raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; messages are on {_named(topics)}")
+        return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
     if not topics:
+        from copem_replay.formats.known import LISTS
+
         raise RecordingError(
-            f"{log.path}: no list of true objects; read are {' and '.join(osi.TRUTH_SCHEMAS)} (protobuf), "
-            f"the file holds {_listed(log.channels)}"
+            f"{log.path}: no list of true objects; known by name are {', '.join((*osi.TRUTH_SCHEMAS, *LISTS))}; any "
+            "other can be read by naming its fields (`read: {topic: …, objects: …}`); the file holds "
+            f"{_listed(log.channels)}"
         )
     if topic is not None and topic not in topics:
         raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; they are on {_named(topics)}")
@@ -111,7 +169,8 @@ def choose_topic(log: Log, topic: str | None = None, beside: Collection[str] = (
             f"{log.path}: true objects on several topics, {_named(topics)}: "
             "choose one with `read: {topic: …}` in the experiment"
         )
-    return chosen, _ignored(log, chosen, topics, beside)
+    poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
+    return chosen, _ignored(log, chosen, topics, beside, poses_read=poses_read)
 
 
 def _only(topics: dict[str, str]) -> str | None:
@@ -121,14 +180,62 @@ def _only(topics: dict[str, str]) -> str | None:
     return candidates[0] if len(candidates) == 1 else None
 
 
-def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[str]) -> list[str]:
+def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[str], *, poses_read: bool) -> list[str]:
     """Say what is not read."""
     notes = [f"topic {t} ({schema}) not read: {chosen} taken" for t, schema in topics.items() if t != chosen]
     skipped = Counter[str]()
+    poses: set[int] = set()
+    if poses_read and (others := foreign(log)):
+        from copem_replay.formats.poses import is_pose
+
+        poses = {c.number for c in others if is_pose(c)}
     for channel in log.channels:
-        if channel.messages and not is_truth(channel) and channel.topic not in beside:
+        there = channel.messages and channel.number not in poses
+        of_topic = is_truth(channel) or channel.schema == topics.get(
+            channel.topic
+        )  # else another kind of message on it
+        if there and not (channel.topic in topics and of_topic) and channel.topic not in beside:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
     return notes + [f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
+
+
+def _columns(
+    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, *, seek_ego: bool
+) -> tuple[Columns, Surroundings | None, str]:
+    """All that is on a topic, in the world, and the ego; the world's name. Raises RecordingError, BrokenIndexError."""
+    channels = [c for c in log.channels if c.topic == topic and c.messages]
+    if fields is None and any(not is_truth(c) for c in channels):  # channels of one topic may be of several schemas
+        from copem_replay.formats.known import is_list, names_objects
+
+        channels = [c for c in channels if is_truth(c) or is_list(c)]
+        channels.sort(key=lambda c: not names_objects(c))
+    if not channels:
+        raise RecordingError(f"{log.path}: {topic}: no message can be read{f' ({log.damage})' if log.damage else ''}")
+    if fields is None and any(is_truth(c) for c in channels):
+        columns = _decode(log, topic)
+        if asked is None:
+            return columns, None, ""
+        from copem_replay.topics import surroundings, with_ego
+
+        around = surroundings(log, asked, seek_ego=False)
+        return _with_notes(with_ego(columns, around), around), around, ""
+    from copem_replay.formats.known import names_objects
+    from copem_replay.topics import in_world, lists_of, surroundings, with_ego
+
+    around = surroundings(log, asked, seek_ego=seek_ego)
+    mine = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
+    found = lists_of(log, mine, fields)
+    if (fields is None and not names_objects(mine[0])) or (fields is not None and fields.id is None):
+        raise RecordingError(
+            f"{log.path}: {topic}: its objects have no ids; lists of a unit they can be, not the truth"
+        )
+    world = around.world_of(found)
+    found = in_world(found, around, f"{log.path}: {topic}")
+    return _with_notes(with_ego(found.columns, around), around), around, world
+
+
+def _with_notes(columns: Columns, around: Surroundings) -> Columns:
+    return replace(columns, notes=(*columns.notes, *around.notes))
 
 
 def _decode(log: Log, topic: str) -> Columns:
@@ -146,7 +253,7 @@ def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
         return None
     if log.complete:
         return f"damaged: {log.damage}"
-    channels = [c for c in log.channels if c.topic == topic and is_truth(c)]
+    channels = [c for c in log.channels if c.topic == topic]
     number = sum(c.messages for c in channels)
     expected = sum(c.expected for c in channels if c.expected is not None)
     of = f" of {expected}" if expected else ""

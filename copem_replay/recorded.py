@@ -19,7 +19,9 @@ from copem_replay.experiment import Recorded
 from copem_replay.fusion.agree import AGREE
 from copem_replay.lists import RecordedLists, read_recorded
 from copem_replay.resample import at_instants
+from copem_replay.topics import Surroundings
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, joined
+from copem_replay.unit_lists import read_listed
 from copem_replay.wording import counted
 
 MOVING_MPS = 2.0
@@ -43,12 +45,14 @@ class RecordedUnits:
     track_id: Int
 
 
-def recorded_unit(path: Path, scene: Scene, name: str, asked: Recorded) -> tuple[RecordedLists, list[str]]:
-    """A unit's lists with all that is asked for, and what has to be said of them.
+def recorded_unit(
+    path: Path, scene: Scene, name: str, asked: Recorded, around: Surroundings | None = None
+) -> tuple[RecordedLists, list[str]]:
+    """A unit's lists with all that is asked for, and what has to be said of them. `around`: the frames of the truth.
 
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
-    found = read_recorded(path, asked.topic, scene)
+    found = read_listed(path, asked.topic, scene, around) or read_recorded(path, asked.topic, scene)
     tracks = found.tracks
     if not len(tracks.stamp_ns):
         raise RecordingError(f"{path}: {asked.topic}: holds no list")
@@ -56,7 +60,7 @@ def recorded_unit(path: Path, scene: Scene, name: str, asked: Recorded) -> tuple
     if unsaid.any() and asked.covariance_m2 is None:
         raise RecordingError(
             f"{path}: {asked.topic}: {unsaid.sum()} of {counted(len(unsaid), 'entry', 'entries')} say nothing of their "
-            "covariance (base_rmse.position); give `covariance_m2`"
+            "covariance; give `covariance_m2`"
         )
     notes = [f"unit {name}: {found.dropped} of its entries have no position and are left out"] if found.dropped else []
     columns: dict[str, Any] = {}

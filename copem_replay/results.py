@@ -124,16 +124,17 @@ def _fill(
 
 
 def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> list[str]:
+    from copem_replay.families import family_of
     from copem_replay.show import write_rrd
     from copem_replay.write import write_mcap
 
+    recording = next(r for r in recordings if r.scene.log == log)
     number = shown_run(experiment, result, log)
     assert number is not None  # shown_logs names none otherwise
     replay = next(r for r in result.replays if r.scene.log == log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
     alone = of_run(chosen, replay.scene, number)
     if alone is not chosen:  # with the units that this run has
-        recording = next(r for r in recordings if r.scene.log == log)
         replay = prepare(recording, alone, onsets_of=experiment)
     beliefs = believed(replay, alone, number)
     of_run_shown = (result.table["log"] == log) & (result.table["run"] == number)
@@ -145,7 +146,9 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
         "log": log,
         "run": str(number),
     }
-    said = write_mcap(Path(f"{target}.mcap"), log_path_of(recordings, log), replay.scene, beliefs, rows, manifest)
+    said = write_mcap(
+        Path(f"{target}.mcap"), recording.path, replay.scene, beliefs, rows, manifest, family_of(recording)
+    )
     write_rrd(
         Path(f"{target}.rrd"),
         replay,

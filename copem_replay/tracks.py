@@ -79,6 +79,7 @@ class Scene:
     object_class: NDArray[np.int8]  # (N,) index into CLASSES
     moving: Bool  # (N,)
     ego_ix: int = -1
+    ego_sized: bool = True  # False: nobody says how large the ego is, and gaps to it are not known
 
     @cached_property
     def object_number(self) -> dict[str, int]:

@@ -1,20 +1,18 @@
 """MCAP out: the input's channels with their messages untouched, and what each configuration believed.
 
-For each configuration three channels: `copem/<configuration>/objects` (osi3.SensorData), `…/scene`
-(foxglove.SceneUpdate) and `…/detail` (JSON: what SensorData cannot carry), one message per fused list, log_time =
-publish_time = the instant it was available. The same input gives the same bytes; the file appears under its name when
-it is complete, or not at all.
+For each configuration three channels: `copem/<configuration>/objects` (what was believed), `…/scene` (the same as
+boxes) and `…/detail` (JSON: what the objects cannot carry), in messages of the input's family (`families.py`), one per
+fused list, log_time = publish_time = the instant it was available. The same input gives the same bytes; the file
+appears under its name when it is complete, or not at all.
 """
 
 from __future__ import annotations
 
 import heapq
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,7 +21,8 @@ from mcap.writer import Writer
 
 from copem_replay.atomic import atomic_file
 from copem_replay.colours import configuration_colours
-from copem_replay.formats import detail, foxglove, sensor_data
+from copem_replay.families import OSI_CHANNEL, Family, ListWriter, Osi, osi_version, topics_of
+from copem_replay.formats import detail
 from copem_replay.fusion.belief import Belief
 from copem_replay.passthrough import Catalogue, Original
 from copem_replay.tracks import Scene, Tracks
@@ -32,7 +31,8 @@ OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
 RUN_RECORD = "org.copem_replay.run"
 """Our own record: what made the file."""
-OSI_CHANNEL = "net.asam.osi.trace.channel."
+ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
+"""rosbag2's own record, and what in it counts the messages: no longer true of a copy with more of them."""
 
 
 def write_mcap(
@@ -42,52 +42,37 @@ def write_mcap(
     beliefs: Mapping[str, Belief],
     table: pd.DataFrame,
     manifest: Mapping[str, str],
+    family: Family | None = None,
 ) -> list[str]:
     """`source` with the fused lists of one run added: `beliefs[configuration]` has values (1, P).
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
-    `manifest`: what made the file, kept as a metadata record.
+    `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
 
     Returns what has to be said of what could not be copied, or was replaced.
 
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
     original = Original(source)
+    family = family or Osi()
     colours = configuration_colours(beliefs)
-    osi_version = ".".join(map(str, sensor_data.OSI_VERSION))
-    protobuf = version("protobuf")
+    units = dict.fromkeys(unit for belief in beliefs.values() for unit in belief.heard.units)
+    numbers = {unit: k + 1 for k, unit in enumerate(units)}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)
-        topics = {name: [f"copem/{name}/{kind}" for kind in ("objects", "scene", "detail")] for name in beliefs}
-        ours = {topic for mine in topics.values() for topic in mine}
+        ours = {topic for name in beliefs for topic in topics_of(name)}
         streams = [original.messages(original.register(catalogue, without=ours))]
-        list_schema = _schema(catalogue, sensor_data.message_class(), sensor_data.SCHEMA)
-        scene_schema = _schema(catalogue, foxglove.message_class(), foxglove.SCHEMA)
-        detail_schema = catalogue.schema(detail.SCHEMA, "jsonschema", json.dumps(detail.JSON_SCHEMA).encode())
-        units = dict.fromkeys(unit for belief in beliefs.values() for unit in belief.heard.units)
-        numbers = {unit: k + 1 for k, unit in enumerate(units)}
+        opened = family.open(catalogue, scene, numbers)
         for name, belief in beliefs.items():
-            description = {
-                f"{OSI_CHANNEL}description": f"fused object list of configuration {name}",
-                f"{OSI_CHANNEL}osi_version": osi_version,
-                f"{OSI_CHANNEL}protobuf_version": protobuf,
-            }
-            objects = catalogue.channel(topics[name][0], "protobuf", list_schema, description)
-            scenes = catalogue.channel(topics[name][1], "protobuf", scene_schema, {})
-            details = catalogue.channel(topics[name][2], "json", detail_schema, {})
             events = _events(belief.fused, table[table["configuration"] == name])
-            writers = {
-                objects: sensor_data.SensorDataWriter(scene, belief, numbers),
-                scenes: foxglove.SceneWriter(scene, belief, name, colours[name]),
-                details: detail.DetailWriter(scene, belief, events),
-            }
-            streams.append(_lists(scene, belief.fused, writers))
-        for name, record in original.metadata.items():
-            if name not in (OSI_RECORD, RUN_RECORD):
-                writer.add_metadata(name, record)
+            streams.append(_lists(scene, belief.fused, opened.channels(name, belief, events, colours[name])))
         units_record = {f"unit.{number}": unit for unit, number in numbers.items()}
+        for name, record in _kept(original).items():
+            if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
+                writer.add_metadata(name, record)
         writer.add_metadata(RUN_RECORD, dict(sorted({**manifest, **units_record}.items())))
-        writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version, protobuf))
+        if family.osi:
+            writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
         for message in heapq.merge(*streams, key=lambda m: m.log_time):
             writer.add_message(
                 message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
@@ -97,7 +82,7 @@ def write_mcap(
     return [*([original.damage] if original.damage else []), *notes]
 
 
-def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, Any]) -> Iterator[Message]:
+def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
     for frame, available_s in enumerate(fused.arrives_s[0].tolist()):
         available_ns = scene.t0_ns + round(available_s * 1e9)
         for channel, writer in writers.items():
@@ -116,11 +101,12 @@ def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]
     return events
 
 
-def _schema(catalogue: Catalogue, message_class: Any, name: str) -> int:
-    from mcap_protobuf.schema import build_file_descriptor_set
-
-    data = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)
-    return catalogue.schema(name, "protobuf", data)
+def _kept(original: Original) -> dict[str, dict[str, str]]:
+    """The input's metadata records, without what its new messages belie."""
+    records = dict(original.metadata)
+    rosbag = records.pop(ROSBAG_RECORD, {})
+    rest = {key: value for key, value in rosbag.items() if key != ROSBAG_COUNTS}
+    return records | ({ROSBAG_RECORD: rest} if rest else {})
 
 
 def _osi_record(original: Original, osi_version: str, protobuf: str) -> dict[str, str]:

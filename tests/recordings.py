@@ -104,6 +104,7 @@ class Topic:
     messages: Sequence[tuple[int, bytes]] = ()
     encoding: str = "protobuf"
     metadata: dict[str, str] = field(default_factory=dict)
+    definition: tuple[str, bytes] | None = None  # encoding and text of the schema
 
 
 def write_mcap(
@@ -122,7 +123,8 @@ def write_mcap(
         out.start(profile=profile, library="tests")
         numbered = []
         for order, topic in enumerate(topics):
-            schema = out.register_schema(topic.schema, topic.encoding, b"") if topic.schema else 0
+            encoding, text = topic.definition or (topic.encoding, b"")
+            schema = out.register_schema(topic.schema, encoding, text) if topic.schema else 0
             channel = out.register_channel(topic.name, topic.encoding, schema, topic.metadata)
             numbered += [(log_ns, order, channel, data) for log_ns, data in topic.messages]
         if by_time:

@@ -93,6 +93,7 @@ class TestUsage:
             (["replay"], "No such command 'replay'."),
             (["--nope"], "No such option: --nope"),
             (["info"], "Missing argument 'LOG...'."),
+            (["init"], "Missing argument 'LOG'."),
             (["check"], "Missing argument 'EXPERIMENT'."),
             (["check", "a", "b"], "unexpected extra argument"),
             (["run"], "Missing argument 'EXPERIMENT'."),
@@ -118,7 +119,7 @@ class TestUsage:
         assert line.startswith("copem-replay: ")
         assert said in line
 
-    @pytest.mark.parametrize("command", [[], ["info"], ["check"], ["run"], ["compare"], ["view"], ["schema"]])
+    @pytest.mark.parametrize("command", [[], ["info"], ["init"], ["check"], ["run"], ["compare"], ["view"], ["schema"]])
     @pytest.mark.parametrize("option", ["--help", "-h"])
     def test_help(self, call: Call, command: list[str], option: str) -> None:
         ended = call(*command, option)
@@ -138,7 +139,9 @@ class TestUsage:
 
 
 class TestInstalled:
-    @pytest.mark.parametrize("arguments", [["--help"], ["info", "drive.mcap"], ["info", "drive.mcap", "--json"]])
+    @pytest.mark.parametrize(
+        "arguments", [["--help"], ["info", "drive.mcap"], ["info", "drive.mcap", "--json"], ["init", "drive.mcap"]]
+    )
     def test_heavy_imports_happen_where_they_are_used(self, here: Path, arguments: list[str]) -> None:
         code = (
             "import sys; from copem_replay import cli; code = cli._ended(); "

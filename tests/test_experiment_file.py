@@ -269,7 +269,7 @@ class TestIds:
         assert found.measure.objects.ids == ("7", "12")
         assert found.measure.distance_to == "8"
 
-    @pytest.mark.parametrize(("value", "said"), [("1.0", "1.0"), ("true", "true"), ("[1]", "[1]"), ("{}", "{}")])
+    @pytest.mark.parametrize(("value", "said"), [("1.0", "1.0"), ("true", "true"), ("[1]", "[1]")])
     def test_are_nothing_else(self, tmp_path: Path, value: str, said: str) -> None:
         assert problems(tmp_path, TEXT + f"ego: {value}\n") == [f"19: ego: expected text, found {said}"]
 

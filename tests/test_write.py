@@ -22,6 +22,8 @@ from copem_replay.check import problems, read_logs
 from copem_replay.errors import OutputError, RecordingError
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, log_paths
+from copem_replay.families import family_of
+from copem_replay.formats import sensor_data
 from copem_replay.fusion.belief import Belief
 from copem_replay.lists import read_lists
 from copem_replay.read import read
@@ -264,6 +266,50 @@ def test_lists_that_cannot_be_decoded_and_a_foreign_detail_topic(written: Writte
 def test_the_same_bytes_again(written: Written, tmp_path: Path) -> None:
     written.write(tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == written.path.read_bytes()
+
+
+def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path) -> None:
+    """Channels and records in their places: what is written for other families moves nothing here."""
+    family = family_of(written.recording)
+    manifest = {"experiment": "version: 1", "run": str(RUN)}
+    path = tmp_path / "out.mcap"
+    write_mcap(path, SOURCE, written.replay.scene, written.beliefs, written.table, manifest, family)
+    assert path.read_bytes() == written.path.read_bytes()
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        records = [record.name for record in reader.iter_metadata()]
+    assert summary is not None
+    assert records == [RUN_RECORD, OSI_RECORD]
+    ours = [c for c in summary.channels.values() if c.topic.startswith("copem/")]
+    kinds = (
+        ("objects", "protobuf", "osi3.SensorData", True),
+        ("scene", "protobuf", "foxglove.SceneUpdate", False),
+        ("detail", "json", "copem_replay.ListDetail", False),
+    )
+    others = len(summary.channels) - len(ours)
+    assert [(c.id, c.topic, c.message_encoding, summary.schemas[c.schema_id].name, bool(c.metadata)) for c in ours] == [
+        (others + 1 + 3 * k + i, f"copem/{name}/{kind}", *rest)
+        for k, name in enumerate(written.beliefs)
+        for i, (kind, *rest) in enumerate(kinds)
+    ]
+    scene = written.replay.scene
+    for name, belief in written.beliefs.items():
+        numbers = {v: int(k[5:]) for k, v in metadata(path)[RUN_RECORD].items() if k.startswith("unit.")}
+        plain = sensor_data.SensorDataWriter(scene, belief, numbers)
+        lists = [(m[1], m[4]) for m in messages(path) if m[0] == f"copem/{name}/objects"]
+        assert lists == [(at, plain.message(frame, at)) for frame, (at, _) in enumerate(lists)]
+
+
+def test_what_counts_the_messages_is_dropped(written: Written, tmp_path: Path) -> None:
+    source = tmp_path / "bag.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="other")
+        writer.add_metadata("rosbag2", {"serialized_metadata": "message_count: 1"})
+        writer.finish()
+    written.write(tmp_path / "out.mcap", source=source)
+    assert "rosbag2" not in metadata(tmp_path / "out.mcap")
 
 
 def test_written_into_its_own_output_the_old_lists_are_replaced_and_it_is_said(

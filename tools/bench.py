@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 import bench_fusion
+import bench_read
 from copem_replay.check import problems, read_logs
 from copem_replay.experiment_file import load, log_paths
 from copem_replay.read import read
@@ -122,7 +123,8 @@ def reading() -> Iterator[dict[str, object]]:
         _write_truth(path, boxes(1200, 60))
         ours = best(lambda: read(path, name="read"), 3)
         plain = best(lambda: _plain_loop(path), 3)
-    yield {"read_ratio": round(ours / plain, 3), "read_objects_per_s": round(72_000 / ours)}
+        yield {"read_ratio": round(ours / plain, 3), "read_objects_per_s": round(72_000 / ours)}
+        yield from bench_read.benches(folder, path, best)
 
 
 def writing() -> Iterator[dict[str, object]]:

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from copem_replay.tracks import Bool, Float, Int
 
+LAST_NS = 4_000_000_000 * 10**9
+"""A later time is none (chosen: Unix time of 2096; differences of such times still fit 64 bits)."""
+
 
 @dataclass(frozen=True)
 class Columns:

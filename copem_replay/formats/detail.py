@@ -1,8 +1,8 @@
-"""What osi3.SensorData cannot carry of a fused list, losslessly, as JSON beside it.
+"""What a list of objects cannot carry of a fused list, losslessly, as JSON beside it.
 
 One message per list on `copem/<configuration>/detail`: the full covariance and variances of each object, the entries of
 the units' lists it was made of (parallel lists of unit, capture, range, visible share), and what was detected with it.
-Of a fusion without truth ids: what it claims of the existence, and no entries.
+Of a fusion without truth ids: what it claims of the existence, and no entries. Objects are in the order of the list.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from copem_replay.fusion.belief import Belief
-from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Scene
+from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Bool, Scene
 
 SCHEMA = "copem_replay.ListDetail"
 Event = Mapping[str, Any]
@@ -48,10 +50,13 @@ JSON_SCHEMA = {
 class DetailWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, list by list.
 
-    `events[k]` is what was detected with list k.
+    `events[k]` is what was detected with list k. `sizes_of` (P,): of which objects the list beside does not say how
+    long and how wide they are.
     """
 
-    def __init__(self, scene: Scene, belief: Belief, events: Mapping[int, Sequence[Event]]) -> None:
+    def __init__(
+        self, scene: Scene, belief: Belief, events: Mapping[int, Sequence[Event]], sizes_of: Bool | None = None
+    ) -> None:
         fused, heard, used = belief.fused, belief.heard, belief.used
         self._fused, self._listed, self._events = fused, belief.listed, events
         self._ids = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
@@ -68,6 +73,7 @@ class DetailWriter:
         }
         self._start = belief.used_start.tolist()
         self._said = belief.said
+        self._sizes_of = np.zeros(len(fused.frame_ix), dtype=bool) if sizes_of is None else sizes_of
 
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
@@ -83,9 +89,11 @@ class DetailWriter:
     def _object(self, row: int) -> dict[str, Any]:
         first, last = self._start[row], self._start[row + 1]
         claimed = {} if self._said is None else {"existence": float(self._said["existence"][row])}
+        sides = ("length_m", "width_m") if self._sizes_of[row] else ()
         return {
             "id": self._ids[row],
             **claimed,
+            **{name: float(getattr(self._fused, name)[0, row]) for name in sides},
             **{name: values[row] for name, values in self._variances.items()},
             **{name: values[first:last] for name, values in self._entries.items()},
         }

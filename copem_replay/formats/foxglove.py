@@ -17,6 +17,8 @@ from copem_replay.tracks import CLASSES, Scene
 SCHEMA = "foxglove.SceneUpdate"
 FRAME_ID = "global"
 """Name of the world frame in the OSI converters of these viewers."""
+ALPHA = 0.5
+"""How opaque boxes are (chosen: what is inside stays visible)."""
 
 
 def message_class() -> Any:
@@ -29,13 +31,16 @@ def message_class() -> Any:
 class SceneWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
 
-    def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb) -> None:
+    def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb, frame_id: str = FRAME_ID) -> None:
         fused = belief.fused
         self._listed = belief.listed
         # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
         names = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
         kinds = belief.class_of(scene).tolist()
-        made = {key: _prototype(*key, configuration, colour) for key in dict.fromkeys(zip(names, kinds, strict=True))}
+        made = {
+            key: _prototype(key[0], metadata(*key, configuration), colour, frame_id)
+            for key in dict.fromkeys(zip(names, kinds, strict=True))
+        }
         self._prototype = [made[key] for key in zip(names, kinds, strict=True)]
         half = fused.yaw_rad[0] / 2
         columns = [getattr(fused, n)[0] for n in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")]
@@ -60,18 +65,19 @@ class SceneWriter:
         return encoded
 
 
-def _prototype(name: str, class_ix: int, configuration: str, colour: Rgb) -> Any:
+def metadata(name: str, class_ix: int, configuration: str) -> dict[str, str]:
+    """What a click on a box tells."""
+    return {"configuration": configuration, "class": CLASSES[class_ix], "object": name}
+
+
+def _prototype(name: str, said: dict[str, str], colour: Rgb, frame_id: str) -> Any:
     """A box with all that its object and its configuration say."""
     from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 
-    entity = SceneEntity(frame_id=FRAME_ID, id=name)
-    for key, text in (
-        ("configuration", configuration),
-        ("class", CLASSES[class_ix]),
-        ("object", name),
-    ):
+    entity = SceneEntity(frame_id=frame_id, id=name)
+    for key, text in said.items():
         entity.metadata.add(key=key, value=text)
     color = entity.cubes.add().color
     color.r, color.g, color.b = (c / 255 for c in colour)
-    color.a = 0.5
+    color.a = ALPHA
     return entity

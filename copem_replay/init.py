@@ -1,0 +1,252 @@
+"""The experiment that would replay a recording, as text: from what `info.survey` found, to begin with.
+
+`short` is what `info` ends with; `commented` is what `init` writes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+_PLAIN = re.compile(r"(?:[A-Za-z_/]|\.{1,2}/)(?:[A-Za-z0-9_./-]*[A-Za-z0-9_/])?")
+"""Text that means itself, in YAML, without quotes, in a list or out of it."""
+_WORDS = ("null", "true", "false")
+_UNIT = "[[0.5, 0.0], [0.0, 0.5]]"
+_GENERIC = {"objects", "object", "sensordata", "detections", "tracks", "lists", "list", "markers", "data", "msg"}
+_OTHERS = 6  # topics named in a comment (chosen)
+
+
+def main_truth(survey: dict[str, Any]) -> dict[str, Any]:
+    """Of the lists of true objects that were read, the one with the most object states."""
+    truth: dict[str, Any] = max(survey["truth"], key=lambda truth: truth["states"])
+    return truth
+
+
+def short(survey: dict[str, Any]) -> list[str]:
+    """The experiment in as few lines as show its parts."""
+    truth = main_truth(survey)
+    guess = truth["suggested"]
+    ego, recorded = guess["ego"] != "none", _recorded(truth)[:1]
+    masts = [] if ego and recorded else guess["masts"][:1]
+    lines = ["version: 1", f"logs: [{quoted(survey['log'])}]"]
+    lines += [f"read: {{topic: {quoted(truth['topic'])}}}"] if survey["choice"] else []
+    lines += [f"ego: {_ego_value(guess['ego'])}"] if guess["ego"] is not None else []
+    error = "error: {kind: gaussian, covariance_m2: [[1.0, 0.0], [0.0, 1.0]]}"
+    lines += [f"pems: {{eyes: [{{detection: {{kind: visible_share}}, {error}}}]}}", "units:"]
+    lines += ["  ego: {on: ego, pem: eyes}"] if ego else []
+    lines += [f"  roadside: {{at: {_list(m['at'])}, height_m: 6.0, pem: eyes}}" for m in masts]
+    lines += [f"  {name}: {{recorded: {_recorded_value(unit)}}}" for name, unit in recorded]
+    first = "ego" if ego else "roadside"
+    lines += ["configurations:", "  GT: {units: truth}", f"  PEM: {{units: [{first}]}}"]
+    if recorded:
+        name = recorded[0][0]
+        units = f"[ego, {name}]" if ego else f"[{name}]"
+        lines.append(f"  {'coPEM' if ego else name}: {{units: {units}}}")
+    elif ego:
+        lines.append("  coPEM: {units: all, latency_s: 0.5}")
+    parts = [f"objects: {{classes: {_list(guess['classes'])}}}"] if guess["classes"] else []
+    parts += ["onset: {kind: appears}"] if guess["onset"] == "appears" else []
+    parts += [] if ego else ["distance_to: roadside"]
+    return lines + ([f"measure: {{{', '.join(parts)}}}"] if parts else [])
+
+
+def commented(survey: dict[str, Any]) -> str:
+    """The experiment with a word on each key; it runs as it is."""
+    truth = main_truth(survey)
+    guess = truth["suggested"]
+    recorded = _recorded(truth)
+    ego = guess["ego"] != "none"
+    first = ["ego", "roadside"] if ego else ["roadside", "across"]
+    lines = [
+        f"# Replays {_plain(survey['recording'])}, {truth['span_s']:.1f} s: {_objects(truth)}.",
+        "# Written by `copem-replay init`, to begin with.",
+        "#",
+        "#   copem-replay check experiment.yaml",
+        "#   copem-replay run experiment.yaml && copem-replay view out/experiment",
+        "version: 1",
+        f"logs: [{quoted(survey['log'])}]   # relative to this file, or absolute; globs work",
+        *_read(survey, truth),
+        *_ego(truth, guess),
+        "runs: 20   # each with its own draws, the same in all configurations; more make the intervals narrower",
+        "seed: 1",
+        "",
+        "# Perception error models: is an object in a unit's list, and how far off? The first couple whose `when`",
+        "# holds applies; where none holds, nothing is listed. These numbers are examples: yours belong here.",
+        "pems:",
+        *_ONBOARD * ego,
+        *_ROADSIDE,
+        "",
+        "units:",
+        *_units(guess, recorded, truth["units"], ego=ego),
+        "",
+        "configurations:",
+        *_configurations(first, [name for name, _ in recorded], ego=ego),
+        "",
+        *_measure(guess, ego=ego),
+        "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+_ONBOARD = [
+    "  onboard:",
+    "    - when: {range_m: [0, 80], azimuth_deg: [-60, 60]}   # far ahead",
+    "      detection: {kind: visible_share}   # listed with the probability of its visible share; or constant, table",
+    "      # variances in m² along and across the line of sight; left out: exact",
+    "      error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.5, 0.0], [0.0, 0.1]]}",
+    "    - when: {range_m: [0, 30]}   # near, all around",
+    "      detection: {kind: visible_share}",
+    "      error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.3, 0.0], [0.0, 0.1]]}",
+]
+_ROADSIDE = [
+    "  roadside:",
+    "    - when: {range_m: [0, 70], azimuth_deg: [-60, 60]}",
+    "      detection: {kind: visible_share}",
+    "      error: {kind: gaussian, frame: line_of_sight, covariance_m2: [[0.6, 0.0], [0.0, 0.3]]}",
+]
+
+
+def _objects(truth: dict[str, Any]) -> str:
+    return ", ".join(f"{number} {name}" for name, number in truth["moving"].items()) or "nothing that moves"
+
+
+def _read(survey: dict[str, Any], truth: dict[str, Any]) -> Iterator[str]:
+    if not survey["choice"]:
+        return
+    others = [t["topic"] for t in survey["truth"] if t["topic"] != truth["topic"]]
+    yield f"read: {{topic: {quoted(truth['topic'])}}}   # where the truth is"
+    yield from (f"# read: {{topic: {quoted(topic)}}}   # could be it, too" for topic in others[:_OTHERS])
+
+
+def _ego(truth: dict[str, Any], guess: dict[str, Any]) -> Iterator[str]:
+    """Whose eyes: as the log says, or a guess that says so."""
+    ego, why = guess["ego"], _plain(guess["ego_why"])
+    if ego is None:
+        yield f"# ego: <id>   # left out: {why}"
+    elif isinstance(ego, dict):
+        yield f"ego:   # {why}"
+        yield from (f"  {key}: {quoted(value)}" for key, value in ego.items())
+        yield "  # size_m: [4.5, 1.8, 1.5]   # its length, width, height: without, gaps and braking are unknown"
+        yield "  # centre_from_rear_axle_m: 1.4   # from these poses, often the rear axle's, ahead to its centre"
+    else:
+        yield f"# {why}"
+        yield f"ego: {quoted(ego)}" + ("" if ego == "none" else "   # a guess; none: no ego, a mast judged by itself")
+        if ids := truth["vehicles"]:
+            yield f"# ego: <id>   # of {_plain(ids)}"
+
+
+def _units(
+    guess: dict[str, Any],
+    recorded: Sequence[tuple[str, dict[str, Any]]],
+    lists: Sequence[dict[str, Any]],
+    *,
+    ego: bool,
+) -> Iterator[str]:
+    if ego:
+        yield "  ego: {on: ego, pem: onboard}   # on the roof, or at height_m; a list per frame, or rate_hz"
+        yield "  # A mast where most measured objects come by: x, y in metres as in the log, yaw_deg from the x axis"
+    else:
+        yield "  # Two masts that face each other where most objects come by: x, y in metres as in the log"
+    for name, mast in zip(("roadside", "across"), guess["masts"][: 1 if ego else 2], strict=False):
+        yield f"  {name}: {{at: {_list(mast['at'])}, yaw_deg: {mast['yaw_deg']}, height_m: 6.0, pem: roadside}}"
+    if ego:
+        yield "  # others: {on: {classes: [car, truck], share: 0.3}, pem: onboard}   # carried by 30 % of them (V2V)"
+    if recorded:
+        yield "  # Lists as they were recorded. `delay_s`, `covariance_m2`: for messages that don't say when they were"
+        yield "  # captured, and how uncertain they are."
+    for name, unit in recorded:
+        yield f"  {name}: {{recorded: {_recorded_value(unit)}}}"
+    for unit in lists:
+        if unit["problem"]:
+            yield f"  # {quoted(unit['topic'])} cannot be a unit: {_plain(unit['problem'])}"
+
+
+def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool) -> Iterator[str]:
+    """Nobody errs, one alone, all together: at once, late, and through a fusion that sees no truth."""
+    both = f"{{units: [{', '.join(first)}]"
+    rows = [
+        ("GT", "{units: truth}", "all that is there, at once, without error"),
+        ("PEM", f"{{units: [{first[0]}]}}", "the vehicle on its own" if ego else "one mast on its own"),
+        ("coPEM:0s", f"{both}, fusion: {{kind: ideal}}}}", "together"),
+        ("coPEM:0.5s", f"{both}, fusion: {{kind: ideal}}, latency_s: 0.5}}", "the whole list late"),
+        ("gnn:0.5s", f"{both}, fusion: {{kind: gnn}}, latency_s: 0.5}}", "a fusion that does not know who is who"),
+    ]  # fmt: skip
+    for name in recorded:
+        rows.append((name, f"{{units: [{name}], fusion: {{kind: gnn}}}}", "as it was recorded"))
+        rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], fusion: {{kind: gnn}}}}", "and together"))
+    width = max(len(name) for name, _, _ in rows) + 1
+    for name, value, what in rows:
+        yield f"  {name + ':':<{width}} {value}   # {what}"
+
+
+def _measure(guess: dict[str, Any], *, ego: bool) -> Iterator[str]:
+    kinds = {"vru": "pedestrians, bicycles, motorcycles", "vehicles": "cars, trucks, …"}
+    yield "measure:"
+    if guess["classes"]:
+        said = ", ".join(kinds[name] for name in guess["classes"])
+        yield f"  objects: {{classes: {_list(guess['classes'])}}}   # {said}; or {{ids: [1, 2]}}; left out: all"
+    else:
+        yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
+    if guess["onset"] == "appears":
+        yield "  onset: {kind: appears}   # the clock starts; nobody comes within 50 m of the ego (in_range)"
+    else:
+        yield "  onset: {kind: in_range, range_m: 50}   # the clock starts; or appears, starts_moving, line_of_sight"
+    if not ego:
+        yield "  distance_to: roadside   # there is no ego: ranges and distances are from here"
+    yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
+
+
+def _recorded(truth: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """The unit lists that could be read, by names that say which."""
+    named: dict[str, dict[str, Any]] = {}
+    taken = {"ego", "roadside", "across", "others", "default", "truth", "all", "gt", "pem", "copem", "gnn"}
+    for unit in truth["units"]:
+        if unit["problem"]:
+            continue
+        words = [word for word in re.split(r"[^a-z0-9]+", unit["topic"].lower()) if word]
+        telling = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
+        stem = telling[-1] if telling else "recorded"
+        tries = [stem, *(f"{stem}{k}" for k in range(2, len(truth["units"]) + 3))]
+        name = next(name for name in tries if name not in taken and name not in named)
+        named[name] = unit
+    return list(named.items())
+
+
+def _recorded_value(unit: dict[str, Any]) -> str:
+    parts = [f"topic: {quoted(unit['topic'])}"]
+    parts += [] if unit["captures_said"] else ["delay_s: 0.0"]
+    parts += [] if unit["covariances_said"] else [f"covariance_m2: {_UNIT}"]
+    return f"{{{', '.join(parts)}}}"
+
+
+def _ego_value(ego: str | dict[str, str]) -> str:
+    if isinstance(ego, str):
+        return quoted(ego)
+    return "{" + ", ".join(f"{key}: {quoted(value)}" for key, value in ego.items()) + "}"
+
+
+def _list(values: Sequence[Any]) -> str:
+    return "[" + ", ".join(quoted(v) if isinstance(v, str) else f"{v}" for v in values) + "]"
+
+
+def quoted(text: str) -> str:
+    """Text as YAML has it: in quotes where it would not be read as the same text."""
+    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
+        return text
+    if text.isascii() and text.isdecimal() and str(int(text)) == text:  # ids may be numbers
+        return text
+    return '"' + "".join(_escaped(c) for c in text) + '"'
+
+
+def _escaped(c: str) -> str:
+    if c in '"\\':
+        return f"\\{c}"
+    if c.isprintable():
+        return c
+    return f"\\U{ord(c):08x}"
+
+
+def _plain(text: str) -> str:
+    """One line for a comment."""
+    return "".join(c if c.isprintable() else " " for c in text)

@@ -1,0 +1,232 @@
+"""Read hostile files: recordings that were hit in every way, and what becomes of them.
+
+    python tools/fuzz_read.py --inputs 20000 --seed 1 --minutes 30
+
+Every input is one file made from a seed. It is surveyed and read, then its other lists are read and its messages
+copied, in a process whose memory is watched and that is ended when either takes more than 10 s of computing. Good ends:
+it was read (and what was skipped is said), or it is refused in single lines. Printed are lines of JSON: each defect
+with its seed and the file that shows it, at the end the counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import resource
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+LONGEST_S = 10.0
+MOST_BYTES = 1_000_000_000
+_ROOM_BYTES = 3 << 30  # of address space beside what is taken at the start
+READ, REFUSED = "read", "refused"
+
+
+def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """What becomes of a file: `read` or `refused`, or what is wrong with its end.
+
+    It is surveyed and read; `looked` is called then, and its other lists are read and its messages copied.
+    """
+    from copem_replay import container, lists, passthrough, unit_lists
+    from copem_replay.errors import InputError, RecordingError
+    from copem_replay.formats import osi
+    from copem_replay.info import describe, survey
+    from copem_replay.read import read
+
+    said: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            found = survey(path)
+            json.dumps(found, allow_nan=False)
+            said += [*describe(found), *([found["reason"]] if found["reason"] else [])]
+            try:
+                recording = read(path, name="log")
+                said += recording.notes
+                end = READ
+            except InputError as error:
+                said += error.problems
+                end = REFUSED
+                recording = None
+            looked()
+            if (end == READ) > found["readable"]:
+                return {"outcome": "defect", "what": "read, but the survey says it cannot be"}
+            if recording is not None:
+                for topic in {c.topic: c.schema for c in container.open_log(path).channels if c.messages}.items():
+                    try:
+                        if topic[1] == osi.SENSOR_DATA:
+                            lists.read_recorded(path, topic[0], recording.scene)
+                        else:
+                            unit_lists.read_listed(path, topic[0], recording.scene, recording.around)
+                    except RecordingError as error:
+                        said += error.problems
+            try:
+                original = passthrough.Original(path)
+                for _message in original.messages({number: number for number in original.channels}):
+                    pass
+            except RecordingError as error:
+                said += error.problems
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            frames = traceback.extract_tb(error.__traceback__)
+            ours = [f for f in frames if "copem_replay" in f.filename]
+            where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}" if ours else "?"
+            return {"outcome": "defect", "what": f"{type(error).__name__} at {where}: {str(error)[:200]}"}
+    for line in said:
+        if len(line.splitlines()) > 1 or not all(c.isprintable() for c in line):
+            return {"outcome": "defect", "what": f"not one printable line: {line[:150]!r}"}
+    return {"outcome": end, "said": said}
+
+
+def _peak_bytes() -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def _serve(pipe: Any, folder: str, most: int, own: bool) -> None:
+    """Make and read the inputs that are asked for, until there are no more."""
+    from fuzz_mutate import hostile
+    from fuzz_samples import samples
+
+    all_samples = samples(most, own=own)
+    path, warm = Path(folder) / "input.mcap", Path(folder) / "warm.mcap"
+    for sample in all_samples:  # compiles
+        from fuzz_container import Model, Piece
+
+        warm.write_bytes(Model([Piece([*sample.schemas, *sample.channels, *sample.messages])]).written())
+        outcome(warm)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    room = pages * resource.getpagesize() + _ROOM_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (room, room))
+    pipe.send("ready")
+    while (seed := pipe.recv()) is not None:
+        data, done = hostile(all_samples, seed)
+        path.write_bytes(data)
+        del data
+        pipe.send({"seed": seed, "done": done})
+        Path("/proc/self/clear_refs").write_text("5")
+        begin = time.process_time()
+        found = outcome(path, lambda: pipe.send(None))
+        found |= {"seconds": time.process_time() - begin, "bytes": _peak_bytes()}
+        pipe.send(found)
+
+
+class _Worker:
+    """A process that reads; started again when it had to be ended."""
+
+    def __init__(self, folder: Path, most: int, own: bool) -> None:
+        self._arguments = (str(folder), most, own)
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, *self._arguments), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._pipe.recv()
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.join()
+
+    def _answers(self) -> bool:
+        """Wait for an answer: as long as it may compute, which on a busy machine is longer."""
+        begin, wall = self._computed_s(), time.monotonic()
+        while not self._pipe.poll(0.2):
+            if self._computed_s() - begin > LONGEST_S or time.monotonic() - wall > 6 * LONGEST_S:
+                return False
+        return True
+
+    def _computed_s(self) -> float:
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def read(self, seed: str) -> dict[str, Any]:
+        """What becomes of the input of a seed."""
+        about: dict[str, Any] = {"seed": seed, "done": "?"}
+        try:
+            self._pipe.send(seed)
+            about = self._pipe.recv()
+            for _ in range(2):
+                if not self._answers():
+                    break
+                if (end := self._pipe.recv()) is not None:
+                    return about | end
+            found = {"outcome": "defect", "what": f"takes more than {LONGEST_S:g} s", "seconds": LONGEST_S}
+        except EOFError:
+            found = {"outcome": "defect", "what": "the process died", "seconds": 0.0}
+        self.end()
+        self._start()
+        return about | {"bytes": 0} | found
+
+
+def seeds(first: int, number: int) -> Iterator[str]:
+    return (f"{first}:{k}" for k in range(number))
+
+
+def fuzz(
+    inputs: int, seed: int, *, minutes: float = 1e9, most: int = 60, own: bool = False, keep: Path | None = None
+) -> dict[str, Any]:
+    """Read `inputs` files. The counts, the worst, and the defects; `keep`: where files that show one are put."""
+    counts, worst_s, worst_bytes = Counter[str](), (0.0, ""), (0, "")
+    defects: list[dict[str, Any]] = []
+    until = time.monotonic() + 60 * minutes
+    with tempfile.TemporaryDirectory() as folder:
+        worker = _Worker(Path(folder), most, own)
+        for name in seeds(seed, inputs):
+            if time.monotonic() > until:
+                break
+            found = worker.read(name)
+            if found["outcome"] != "defect" and found["bytes"] > MOST_BYTES:
+                found |= {"outcome": "defect", "what": f"takes {found['bytes'] / 1e6:.0f} MB"}
+            counts[found["outcome"]] += 1
+            worst_s = max(worst_s, (found["seconds"], name))
+            worst_bytes = max(worst_bytes, (found["bytes"], name))
+            if found["outcome"] == "defect":
+                if keep is not None:
+                    keep.mkdir(parents=True, exist_ok=True)
+                    found["file"] = str(keep / f"{name.replace(':', '_')}.mcap")
+                    Path(found["file"]).write_bytes((Path(folder) / "input.mcap").read_bytes())
+                found.pop("said", None)
+                defects.append(found)
+                print(json.dumps(found), flush=True)
+        worker.end()
+    return {
+        "inputs": sum(counts.values()),
+        "outcomes": dict(counts),
+        "worst_s": round(worst_s[0], 3),
+        "worst_s_seed": worst_s[1],
+        "worst_mb": round(worst_bytes[0] / 1e6),
+        "worst_mb_seed": worst_bytes[1],
+        "defects": defects,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--inputs", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--keep", type=Path, default=Path("out/fuzz"), help="where files that show a defect are put")
+    asked = parser.parse_args()
+    found = fuzz(asked.inputs, asked.seed, minutes=asked.minutes, keep=asked.keep)
+    kinds = Counter(d["what"].split(": ")[0] for d in found["defects"])
+    print(json.dumps({**found, "defects": dict(kinds.most_common())}))
+    return 1 if kinds else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
