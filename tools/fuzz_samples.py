@@ -11,7 +11,7 @@ import numpy as np
 from fuzz_container import Channel, Message, Sample, Schema, taken_apart
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = (ROOT / "logs", ROOT.parent / "shared" / "data", Path("/work/shared/data"))
+FOLDERS = (ROOT / "logs", ROOT.parent / "shared" / "data")
 
 
 def samples(most: int, *, own: bool = False) -> list[Sample]:
