@@ -81,7 +81,7 @@ def test_benchmarks_print_json_lines(
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     printed = {key for line in lines for key in line}
     assert keys <= printed
-    assert all(value > 0 for line in lines for value in line.values())
+    assert all(value > 0 for line in lines for value in line.values() if not isinstance(value, str))
 
 
 def test_the_benchmarks_plain_loop_reads_what_the_reader_reads(tmp_path: Path) -> None:
