@@ -1,4 +1,4 @@
-"""How far off are the fused lists? Statistics that add up, and the figures made of them.
+"""How far off are the fused lists? Definitions, and statistics that add up.
 
 All is counted once per fused list, at the instant it is available, in the lists at which there is a place to measure
 distances from (the ego). Nothing is held from one list to the next, nothing weighed by time. What a *match* is, a
@@ -41,20 +41,16 @@ AAAI 2015 (expected calibration error); GOSPA and OSPA: `gospa.py`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.accuracy_kernel import Asked, Records, Stays, Sums, World, add_up
-from copem_replay.fusion.object_list import Lists
-from copem_replay.match import Matches
-from copem_replay.onset import Looks, Reference
-from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.accuracy_kernel import Records
+from copem_replay.tracks import Int
 
-_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 EXISTENCE_BINS = 10
 """Of equal width (chosen)."""
 
@@ -137,54 +133,6 @@ class Accuracy:
 _PER_RUN = tuple(f.name for f in fields(Accuracy) if f.name not in ("settings", "first_list", "count"))
 
 
-def assess(
-    lists: Lists,
-    matches: Matches,
-    issue_s: Float,
-    world: Tracks,
-    truth_at_capture: Tracks,
-    scene: Scene,
-    looks: Looks,
-    stay_from_s: Float,
-    reference: Reference,
-    measured_class: Bool,
-    *,
-    settings: Settings,
-) -> Accuracy:
-    """Add up how far off K lists in S runs are.
-
-    `issue_s (K,)`: when each is available, ascending. `world`: the truth then, frame k at the instant of list k;
-    `truth_at_capture`: the truth at the captures, frames ascending. `stay_from_s (M,)`: the first instant that object
-    and ego share, or earlier. `reference`: from where distances are measured, at the instants of the lists.
-    `measured_class (C,)`: what a ghost has to be called to count as one of a measured object.
-    """
-    first = np.searchsorted(issue_s, stay_from_s - _TOLERANCE_S, side="left")
-    count = np.maximum(np.searchsorted(issue_s, looks.ended_s + _TOLERANCE_S, side="right") - first, 0)
-    look_of = np.full(len(scene.object_ids), -1)
-    look_of[looks.object_ix] = np.arange(len(looks.object_ix))
-    stays = Stays(look_of, first, count, np.cumsum(count) - count, looks.onset_s, looks.ended_s)
-    distance_edges_m, time_edges_s = _column(settings.distance_edges_m), _column(settings.time_edges_s)
-    thresholds = _column(settings.existence_thresholds)
-    asked = Asked(settings.cutoff_m, settings.power, measured_class, distance_edges_m, time_edges_s, thresholds)
-    S, M, L = len(lists.start), len(looks.object_ix), int(count.sum())
-    out = Sums(
-        np.full((S, L), np.nan, dtype=np.float32),
-        np.full((S, L), np.nan, dtype=np.float32),
-        np.zeros((S, M), dtype=OBJECT),
-        np.zeros(S, dtype=RUN),
-        np.zeros((S, len(thresholds)), dtype=np.int64),
-        np.zeros((S, max(len(distance_edges_m) - 1, 0)), dtype=BAND),
-        np.zeros((S, max(len(time_edges_s) - 1, 0)), dtype=BAND),
-        np.zeros((S, EXISTENCE_BINS), dtype=EXISTENCE),
-    )
-    out.by_run["lists"], out.by_run["time_s"] = reference.present.sum(), _time_s(issue_s, reference.present)
-    add_up(
-        lists.start, lists.entries, matches.object_ix, matches.role, issue_s, _by_list(world),
-        _by_list(truth_at_capture), stays, reference.x_m, reference.y_m, reference.present, asked, out,
-    )  # fmt: skip
-    return Accuracy(settings, first, count, *out)
-
-
 def for_runs(of: Accuracy, runs: int) -> Accuracy:
     """The same for each of `runs` runs, where one stands for all."""
     if len(of.by_run) == runs:
@@ -193,23 +141,6 @@ def for_runs(of: Accuracy, runs: int) -> Accuracy:
         name: np.broadcast_to(getattr(of, name), (runs, *getattr(of, name).shape[1:])) for name in _PER_RUN
     }
     return replace(of, **columns)
-
-
-def _column(values: tuple[float, ...]) -> Float:
-    return np.array(values, dtype=np.float64)
-
-
-def _by_list(truth: Tracks) -> World:
-    order = np.lexsort((truth.row_object_ix, truth.frame_ix))
-    columns = (getattr(truth, name)[0, order] for name in ("x_m", "y_m", "vx_mps", "vy_mps"))
-    return World(truth.captured_s, truth.by_frame[1], truth.row_object_ix[order], *columns)
-
-
-def _time_s(issue_s: Float, present: Bool) -> float:
-    """The time that the lists with a reference stand for: n lists at a steady rate are n periods. 0: too few to say."""
-    neighbours = present[1:] & present[:-1]
-    spacing_s = np.diff(issue_s)[neighbours]
-    return float(spacing_s.mean() * present.sum()) if len(spacing_s) else 0.0
 
 
 @dataclass(frozen=True)
@@ -263,130 +194,3 @@ def _summed(records: Records) -> Records:
     for name in records.dtype.names or ():
         sums[name] = records[name].sum(axis=0)
     return sums
-
-
-def _ratio(sums: float, count: float) -> float | None:
-    """The mean; None: there is nothing to average."""
-    return float(sums) / float(count) if count > 0 else None
-
-
-def _root(mean: float | None, power: float = 2.0) -> float | None:
-    return None if mean is None else float(mean ** (1.0 / power))
-
-
-def position_rmse_m(of: Total) -> float | None:
-    """Against the truth when the list is available."""
-    return _root(_ratio(of.looks["square_m2"], of.looks["pairs"]))
-
-
-def position_rmse_captured_m(of: Total) -> float | None:
-    """Against the truth at capture."""
-    return _root(_ratio(of.looks["square_captured_m2"], of.looks["pairs_captured"]))
-
-
-def velocity_rmse_mps(of: Total) -> float | None:
-    """Against the truth when the list is available."""
-    return _root(_ratio(of.looks["velocity_square_m2ps2"], of.looks["pairs"]))
-
-
-def bias_east_m(of: Total) -> float | None:
-    """Mean error, entry minus truth."""
-    return _ratio(of.looks["east_m"], of.looks["pairs"])
-
-
-def bias_north_m(of: Total) -> float | None:
-    """Mean error, entry minus truth."""
-    return _ratio(of.looks["north_m"], of.looks["pairs"])
-
-
-def age_s(of: Total) -> float | None:
-    """Mean over pairs."""
-    return _ratio(of.looks["age_s"], of.looks["pairs"])
-
-
-def nees(of: Total) -> float | None:
-    """Mean over pairs; 2 is right."""
-    return _ratio(of.looks["nees"], of.looks["pairs"])
-
-
-def nees_low(of: Total) -> float | None:
-    """Lower limit of the mean of as many independent samples as rows have pairs, 95 %: χ²₂ₙ(0.025) / n."""
-    return _chi_squared(of.matched_rows, 0.025)
-
-
-def nees_high(of: Total) -> float | None:
-    """Upper limit: χ²₂ₙ(0.975) / n."""
-    return _chi_squared(of.matched_rows, 0.975)
-
-
-def _chi_squared(n: int, level: float) -> float | None:
-    from scipy.special import gammaincinv
-
-    return 2.0 * float(gammaincinv(n, level)) / n if n else None
-
-
-def identity_switches(of: Total) -> float | None:
-    """Mean over looks and runs that have a match with a track."""
-    return _ratio(of.looks["switches"], of.tracked_rows)
-
-
-def mtl_s(of: Total) -> float | None:
-    """Mean over looks and runs."""
-    return _ratio(of.looks["mtl_s"], of.rows)
-
-
-def _gospa(of: Total, sums: float) -> float | None:
-    return _root(_ratio(sums, of.runs["lists_looked"]), of.settings.power)
-
-
-def gospa_m(of: Total) -> float | None:
-    """Mean over lists of GOSPAᵖ, to the power 1/p: the p-th powers of its three parts add up to its own."""
-    parts = sum(of.looks[f"gospa_{part}"] for part in ("localisation", "missed", "false"))
-    return _gospa(of, parts)
-
-
-def gospa_localisation_m(of: Total) -> float | None:
-    """The part of the pairs."""
-    return _gospa(of, of.looks["gospa_localisation"])
-
-
-def gospa_missed_m(of: Total) -> float | None:
-    """The part of the misses."""
-    return _gospa(of, of.looks["gospa_missed"])
-
-
-def gospa_false_m(of: Total) -> float | None:
-    """The part of the false entries."""
-    return _gospa(of, of.looks["gospa_false"])
-
-
-def ospa_m(of: Total) -> float | None:
-    """Mean over lists."""
-    return _ratio(of.runs["ospa_m"], of.runs["lists_looked"])
-
-
-def ghosts_per_min(of: Total) -> float | None:
-    """Entries, so that a ghost counts in each list it is in."""
-    return _ratio(60 * of.runs["ghosts"], of.runs["time_s"])
-
-
-def duplicates_per_min(of: Total) -> float | None:
-    """Entries, as ghosts; of measured objects, looked at or not."""
-    return _ratio(60 * of.runs["duplicates"], of.runs["time_s"])
-
-
-def existence_error(of: Total) -> float | None:
-    """Expected calibration error, 0 … 1."""
-    bins = of.by_existence
-    return _ratio(np.abs(bins["with_object"] - bins["existence"]).sum(), bins["entries"].sum())
-
-
-FIGURES: dict[str, Callable[[Total], float | None]] = {
-    figure.__name__: figure
-    for figure in (
-        position_rmse_m, position_rmse_captured_m, bias_east_m, bias_north_m, velocity_rmse_mps, age_s,
-        gospa_m, gospa_localisation_m, gospa_missed_m, gospa_false_m, ospa_m, ghosts_per_min, duplicates_per_min,
-        nees, nees_low, nees_high, existence_error, identity_switches, mtl_s,
-    )
-}  # fmt: skip
-"""Columns of the summary by name."""

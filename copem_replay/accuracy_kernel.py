@@ -1,4 +1,4 @@
-"""The sums of `accuracy.py`, in one pass over the lists of all runs. What they mean is said there."""
+"""The sums of `accuracy.py`, in one pass over lists of all runs. What they mean is said there."""
 
 from __future__ import annotations
 
@@ -67,6 +67,13 @@ class Sums(NamedTuple):
     by_existence: Records
 
 
+class SoFar(NamedTuple):
+    """What goes on from list to list. All (S, M)."""
+
+    last_track: Int  # as which it was matched last, −1: as none
+    unknown_since_s: Float  # NaN: known
+
+
 class _Here(NamedTuple):
     # The objects whose stay has the list at hand, and their matches in the run at hand.
     look: Int
@@ -96,9 +103,10 @@ class _Believed(NamedTuple):
 @nb.njit(cache=True, nogil=True)
 def add_up(
     start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, world: World,
-    at_capture: World, stays: Stays, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: Asked, out: Sums,
+    at_capture: World, stays: Stays, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: Asked,
+    so_far: SoFar, out: Sums,
 ) -> None:  # fmt: skip
-    """Add up the K lists of S runs."""
+    """Add the next K lists of S runs. Numbers of lists in `stays` count from the first of them."""
     S, M = out.by_object.shape
     longest = 0
     for s in range(S):
@@ -112,9 +120,6 @@ def add_up(
         np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64), np.empty(M, np.int64)
     )  # fmt: skip
     believed = _Believed(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
-    last_track = np.full((S, M), -1)
-    unknown_since_s = np.empty((S, M))  # NaN: known
-    unknown_since_s[:] = stays.onset_s
     for k in range(len(issue_s)):
         if not present[k]:
             continue
@@ -134,7 +139,10 @@ def add_up(
                     _look(out.by_object[s], m, i)
                     _look(out.by_distance[s], here.distance_band[h], i)
                     _look(out.by_time[s], time_band, i)
-                _follow(out.by_object[s, m], m, entries, i, issue_s[k], stays, unknown_since_s[s], last_track[s])
+                _follow(
+                    out.by_object[s, m], m, entries, i, issue_s[k], stays, so_far.unknown_since_s[s],
+                    so_far.last_track[s],
+                )  # fmt: skip
                 if i >= 0:
                     p = here.row[h]
                     east_m, north_m = entries[i].x_m - world.x_m[p], entries[i].y_m - world.y_m[p]
@@ -147,11 +155,17 @@ def add_up(
             _gospa(out.gospa[s], column, out.by_object[s], out.by_run[s], targets, looked_at, believed, count, asked)
         for h in range(n):
             here.place_of[here.look[h]] = -1
+
+
+@nb.njit(cache=True, nogil=True)
+def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
+    """Add what ends with the looks, after all lists."""
+    S, M = out.by_object.shape
     for s in range(S):
         for m in range(M):
-            if not np.isnan(unknown_since_s[s, m]):
+            if not np.isnan(so_far.unknown_since_s[s, m]):
                 sums = out.by_object[s, m]
-                sums.mtl_s = max(sums.mtl_s, stays.ended_s[m] - unknown_since_s[s, m])
+                sums.mtl_s = max(sums.mtl_s, stays.ended_s[m] - so_far.unknown_since_s[s, m])
 
 
 @nb.njit(cache=True, nogil=True)

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from copem_replay.accuracy import Accuracy, Settings, assess, for_runs
+from copem_replay.accuracy import Accuracy, Settings, for_runs
+from copem_replay.assess import assess
 from copem_replay.believe import Believed
 from copem_replay.detect import Detections
 from copem_replay.experiment import Experiment

@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from copem_replay.accuracy import FIGURES, Total
+from copem_replay.accuracy import Total
+from copem_replay.accuracy_figures import FIGURES
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.statistics import (
     CENSORED,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
 from copem_replay.tracks import CLASSES
 
+Array = npt.NDArray[Any]
 SAME_S = 1e-6
 """Arrivals closer than this are one instant."""
 
@@ -42,6 +45,21 @@ def lists_of(lists_by_run: Sequence[Sequence[Entries]]) -> Lists:
     first = np.concatenate([[0], ends[:-1, -1]]) if count else np.zeros(len(lists_by_run))
     start = np.concatenate([first[:, None], ends], axis=1).astype(np.int64)
     return Lists(start, joined(*(one for lists in lists_by_run for one in lists)))
+
+
+def between(lists: Lists, first: int, after: int) -> tuple[Lists, Array]:
+    """The lists `first` … `after` − 1 of every run, and which entries of all theirs are."""
+    start = lists.start[:, first : after + 1]
+    lengths = np.diff(start, axis=1)
+    ends = np.cumsum(lengths.sum(axis=1))
+    rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(one[0], one[-1]) for one in start)])
+    return Lists(start - start[:, :1] + (ends - lengths.sum(axis=1))[:, None], lists.entries[rows]), rows
+
+
+def stretches(cuts: Sequence[float], count: int) -> list[tuple[int, int]]:
+    """From where to where `count` things go when they are cut at these shares of them."""
+    places = [0, *sorted(round(cut * count) for cut in cuts), count]
+    return list(pairwise(places))
 
 
 def reports_of(

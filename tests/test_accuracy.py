@@ -13,13 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from accuracy_oracle import Places, looks_of, one_run, permuted, plainly, reference_of, scene_of, truth_of
-from copem_replay import accuracy
-from copem_replay.accuracy import FIGURES, Accuracy, Settings, Total, assess, for_runs, total
+from copem_replay import accuracy_figures
+from copem_replay.accuracy import Accuracy, Settings, Total, for_runs, total
+from copem_replay.accuracy_figures import FIGURES
+from copem_replay.assess import Assessment, assess
 from copem_replay.fusion.object_list import Entries, Lists
 from copem_replay.gospa import gospa, ospa
 from copem_replay.match import Matches, match
 from copem_replay.tracks import CLASSES
-from reports import entry, lists_of
+from reports import between, entry, lists_of, stretches
 from reports import joined as one_list
 
 EGO, CAR, OTHER_CAR = 0, 1, 2
@@ -346,9 +348,9 @@ def test_totals_of_logs_add() -> None:
     first = assessed([entry(11)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
     other = assessed([entry(12)], [NOTHING], places={CAR: [(10, 0)], OTHER_CAR: [(20, 0)]}, looks={CAR: (0, 0), 2: (0, 0)})  # fmt: skip # noqa: E501
     both = total([first]) + total([other])
-    assert accuracy.position_rmse_m(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
+    assert accuracy_figures.position_rmse_m(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
     assert (both.rows, both.matched_rows) == (5, 2)
-    assert accuracy.gospa_m(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
+    assert accuracy_figures.gospa_m(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
     with pytest.raises(ValueError, match="same settings"):
         total([first]) + total([assessed([entry(1)], places={}, looks={}, cutoff_m=4.0)])
 
@@ -424,6 +426,26 @@ class Scenery:
             self.measured, settings=self.settings,
         )  # fmt: skip
 
+    def in_stretches(self, cuts: Sequence[float]) -> Accuracy:
+        """The same, fed with the lists between cuts, their instants, and the captures their entries name."""
+        adding = Assessment(
+            self.times, self.scene, self.looks, self.since_s, self.reference, self.measured, settings=self.settings,
+            runs=len(self.lists.start),
+        )  # fmt: skip
+        for a, b in stretches(cuts, len(self.times)):
+            lists, rows = between(self.lists, a, b)
+            named_s = lists.entries["captured_s"]
+            near = [f for f, t in enumerate(self.captures) if (abs(named_s - t) <= 2e-6).any()]
+            adding.add(
+                lists, Matches(self.found.object_ix[rows], self.found.role[rows]),
+                truth_of({o: way[a:b] for o, way in self.places.items()}, self.times[a:b].tolist(), self.velocity),
+                truth_of(
+                    {o: [way[f] for f in near] for o, way in self.places_captured.items()},
+                    [self.captures[f] for f in near],
+                ),
+            )  # fmt: skip
+        return adding.result()
+
 
 def assert_same(found: Accuracy, expected: Accuracy, *, exactly: bool = True) -> None:
     for column in (f.name for f in fields(Accuracy) if f.name != "settings"):
@@ -468,6 +490,42 @@ def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_m
     assert_equal_totals(total(parts), total([whole]))
     shuffled, _, _ = permuted(made.lists, None, made.rng)
     assert_same(made.of(shuffled, match(shuffled, made.world, made.scene, gate_m=2.0)), whole, exactly=False)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.lists(st.floats(0, 1), max_size=6))
+def test_stretches_add_up_to_the_whole_to_the_last_bit(seed: int, cuts: list[float]) -> None:
+    made = Scenery(seed)
+    assert_same(made.in_stretches(cuts), made.of(made.lists, made.found))
+
+
+def test_what_is_known_and_as_which_track_goes_on_over_a_cut() -> None:
+    lists = [entry(10, track_id=5), NOTHING, NOTHING, entry(10, track_id=7)]
+    made = Scenery(0)
+    made.times, made.lists = np.arange(4.0), lists_of([lists])
+    made.places, made.velocity = {EGO: standing(0, 0, 4), CAR: standing(10, 0, 4)}, {}
+    made.scene, made.looks, made.since_s = scene_of("car", "car"), looks_of({CAR: (0, 3)}), np.zeros(1)
+    made.reference = reference_of(standing(0, 0, 4))
+    made.world = truth_of(made.places, made.times.tolist())
+    made.found = match(made.lists, made.world, made.scene, gate_m=2.0)
+    sums = made.in_stretches([0.5]).by_object[0, 0]
+    assert (sums["switches"], sums["mtl_s"]) == (1, 2.0)
+
+
+def test_lists_too_many_or_too_few_are_a_defect() -> None:
+    made = Scenery(1)
+    none = truth_of({}, [])
+    adding = Assessment(
+        np.arange(2.0), made.scene, made.looks, made.since_s, reference_of([None, None]), made.measured,
+        settings=made.settings, runs=1,
+    )  # fmt: skip
+    no_matches = Matches(np.empty(0, dtype=int), np.empty(0, dtype=np.int8))
+    with pytest.raises(ValueError, match="expected 2 lists, found 0"):
+        adding.result()
+    with pytest.raises(ValueError, match="expected lists of 1 runs, at most 2 of each; found 1 runs of 3"):
+        adding.add(lists_of([[NOTHING] * 3]), no_matches, none, none)
+    with pytest.raises(ValueError, match="found 2 runs of 1"):
+        adding.add(lists_of([[NOTHING]] * 2), no_matches, none, none)
 
 
 @pytest.mark.parametrize("cut", [1, 7, 199])

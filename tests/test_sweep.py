@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 
 from copem_replay import cli
-from copem_replay.accuracy import FIGURES
+from copem_replay.accuracy_figures import FIGURES
 from copem_replay.check import problems, read_logs
 from copem_replay.errors import ExperimentError
 from copem_replay.exact import exact_table
