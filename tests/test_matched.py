@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from accuracy_oracle import looks_of, one_run, permuted
 from copem_replay.fusion.object_list import Lists
 from copem_replay.match import DUPLICATE, GHOST, MATCH, Matches
-from copem_replay.matched import Captures, Steps, captures_of, first_matches
+from copem_replay.matched import Captures, FirstMatches, Steps, captures_of, first_matches
 from copem_replay.measure_keys import Confirm
-from reports import entry, joined, lists_of
+from reports import between, entry, joined, lists_of, stretches
 from test_detect import Unit, World, holds, tracks
 
 
@@ -277,10 +277,11 @@ def items(told: tuple[Any, ...]) -> list[Item]:
     confirm=st.sampled_from([(1, 1), (1, 3), (2, 2), (2, 3), (3, 5)]),
     count_earlier=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
+    cuts=st.lists(st.floats(0, 1), max_size=5),
 )
 def test_as_the_sentences_have_it(
     runs: list[Any], looks: list[tuple[int, int]], first: set[int], second: set[int], confirm: tuple[int, int],
-    count_earlier: bool, seed: int,
+    count_earlier: bool, seed: int, cuts: list[float],
 ) -> None:  # fmt: skip
     objects = (4, 1)
     told = [[items(one) for one in run] for run in runs]
@@ -330,3 +331,42 @@ def test_as_the_sentences_have_it(
     for name in ("detection_s", "captured_s", "first_unit_ix"):
         np.testing.assert_array_equal(getattr(again, name), getattr(detections, name))
     np.testing.assert_array_equal(steps_again.existence, steps.existence)
+    adding = FirstMatches(
+        looks_of(look_at), runs=len(told), confirm=asked, count_earlier=count_earlier, captures=captures
+    )  # fmt: skip
+    for a, b in stretches(cuts, 9):
+        some, rows = between(lists, a, b)
+        adding.add(some, Matches(matches.object_ix[rows], matches.role[rows]), issue_s[a:b])
+    for whole, parts in zip((detections, steps), adding.result(), strict=True):
+        for name, column in vars(whole).items():
+            np.testing.assert_array_equal(getattr(parts, name), column)
+            assert getattr(parts, name).dtype == column.dtype
+
+
+@pytest.mark.parametrize("cut", [1, 2, 3])
+def test_what_confirms_may_lie_on_both_sides_of_a_cut(cut: int) -> None:
+    lists, matches = listed([[[Item(7, 1.0, 0.6)], [Item(7, 2.0, 0.4)], [], [Item(7, 3.0, 0.9)]]])
+    issue_s = np.array([1.0, 2.0, 2.5, 3.0])
+    adding = FirstMatches(
+        looks_of({7: (0.0, 9.0)}), runs=1, confirm=Confirm(hits=2, of=3), count_earlier=False,
+        captures=of_one_unit([1, 2, 3]),
+    )  # fmt: skip
+    for a, b in ((0, cut), (cut, 4)):
+        some, rows = between(lists, a, b)
+        adding.add(some, Matches(matches.object_ix[rows], matches.role[rows]), issue_s[a:b])
+    _, steps = adding.result()
+    assert steps.existence.tolist() == [0.4, 0.6]
+    assert steps.detection_s.tolist() == [2.0, 3.0]
+
+
+def test_little_is_remembered_of_what_is_known() -> None:
+    """However long it is looked at: of captures that make it no surer nothing is kept."""
+    times = [float(t) for t in range(1, 200)]
+    lists, matches = listed([[[Item(7, t, 0.5 + (t % 10 == 0) * 0.3)] for t in times]] * 2)
+    adding = FirstMatches(
+        looks_of({7: (0.0, 999.0)}), runs=2, confirm=Confirm(hits=2, of=3), count_earlier=False,
+        captures=of_one_unit(times),
+    )  # fmt: skip
+    adding.add(lists, matches, np.array(times))
+    # Of both runs every tenth capture, as an instant and as a list.
+    assert len(adding._held) == 2 * 2 * 19
