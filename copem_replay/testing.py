@@ -11,13 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from copem_replay.fusion.component import ListFusion, StepFusion, content_problem, form_problem, inbox_at
+from copem_replay.fusion.component import (
+    ListFusion,
+    StepFusion,
+    content_problem,
+    form_problem,
+    inbox_at,
+    pair_problem,
+)
 from copem_replay.fusion.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports, entries_of
 from copem_replay.fusion.reports import reports
+from copem_replay.fusion.stretch import one_after_another, stretch
 from copem_replay.resample import wrap
 from copem_replay.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
 
@@ -27,6 +36,7 @@ RULES = {
     "again": "the same reports give the same lists, to the last bit: draw nothing, keep nothing but `memory`",
     "runs": "a run gives the same lists, to the last bit, whichever others stand beside it: nothing passes between",
     "causality": "what is issued depends on nothing that arrives later, and is not changed afterwards",
+    "stretches": "where it is `resumable`: handed over in stretches, with `looks_back_s`, instants get the same lists",
     "unheard": "a unit of which nothing arrives makes no difference",
     "order of entries": "entries are in no order that means anything, and each unit numbers its tracks as it likes",
     "order of units": "units are in no order that means anything; if yours are, say units_in_any_order=False",
@@ -78,6 +88,9 @@ def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool 
             trial.same("causality", first, scene.spoiled(later), f"{after} spoiled", until_s=issue_s[k])
         trial.same("unheard", first, scene.beside("unheard"), "and a unit that is not heard")
         trial.same("order of entries", first, scene.shuffled(dice), "entries shuffled and tracks renumbered")
+        if fusion.resumable:
+            trial.resumed(first, np.arange(len(issue_s)))
+            trial.resumed(first, np.sort(np.random.default_rng((seed, number, 2)).integers(0, len(issue_s) + 1, 4)))
         if units_in_any_order:
             other = scene.of_units(dice.permutation(len(scene.units)))
             trial.same("order of units", first, other, f"units in the order {', '.join(other.units)}")
@@ -209,8 +222,30 @@ class _Trial:
     def same(self, rule: str, first: Lists, scene: _Scene, variation: str, *, until_s: float = np.inf) -> None:
         """Whether a variation of the scene gives the lists of `first`: as sets, or to the last bit."""
         scene = replace(scene, name=f"{scene.name}; {variation}")
-        found, issue_s = self.answer(scene), scene.reports().issue_s
-        exact = rule in ("again", "runs")
+        self.compare(rule, first, self.answer(scene), scene, until_s)
+
+    def resumed(self, first: Lists, cuts: Int) -> None:
+        """Whether the scene's instants, cut at these places, get the lists of `first`, to the last bit."""
+        told, memory = self.scene.reports(), None
+        parts: list[Lists] = []
+        scene = replace(self.scene, name=f"{self.scene.name}; instants in stretches")
+        for a, b in pairwise([0, *cuts.tolist(), len(told.issue_s)]):
+            one = stretch(told, a, b, self.fusion.looks_back_s)
+            try:
+                given = self.fusion.resume(one, memory)
+            except Exception as error:
+                said = f"expected Lists and a memory of instants[{a}:{b}], found {type(error).__name__}: {error}"
+                raise self.broken("stretches", scene, said) from error
+            if wrong := pair_problem(given) or form_problem(given[0], one):
+                raise self.broken("stretches", scene, wrong)
+            found, memory = given
+            parts.append(found)
+        self.compare("stretches", first, one_after_another(parts), scene, np.inf)
+
+    def compare(self, rule: str, first: Lists, found: Lists, scene: _Scene, until_s: float) -> None:
+        """Whether the lists found of a scene are those of `first`: as sets, or to the last bit."""
+        issue_s = scene.reports().issue_s
+        exact = rule in ("again", "runs", "stretches")
         whose = np.array([*map((*self.scene.units, *scene.units).index, scene.units), -1])
         for s, run in enumerate(scene.runs):
             called: dict[tuple[str, int], int] = {}

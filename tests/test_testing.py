@@ -330,6 +330,51 @@ class Silent(Plain):
         return entries[:0]
 
 
+class ByTheOneBefore(ListFusion):
+    """Goes by the first list of each unit, which a later stretch has not."""
+
+    kind: str = "test_testing:ByTheOneBefore"
+    resumable: ClassVar[bool] = True
+
+    def fuse(self, reports: Reports) -> Lists:
+        fused = Plain().fuse(reports)
+        for s, k in np.ndindex(len(fused.start), len(reports.issue_s)):
+            came = reports.arrived[: reports.arrived_start[k + 1]]
+            first = came[reports.captured_s[came] == reports.captured_s[came].min()]
+            fused.of(s, k)["z_m"] = sum(len(reports.lists.of(s, f)) for f in first)
+        return fused
+
+
+class ForgetsOverACut(Plain):
+    """Its memory does not survive."""
+
+    def step(self, now_s: float, inbox: Inbox, memory: Any) -> tuple[Entries, Any]:
+        entries, _ = super().step(now_s, inbox, None)
+        memory = (memory or 0) + 1
+        entries["z_m"] = memory
+        return entries, memory
+
+    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+        return super().resume(reports, None)[0], None
+
+
+class OnlyLists(Plain):
+    """Gives no memory where one is asked for."""
+
+    def fuse(self, reports: Reports) -> Lists:
+        return Plain().fuse(reports)
+
+    resumable: ClassVar[bool] = True
+
+    def resume(self, reports: Reports, memory: Any) -> Any:
+        return self.fuse(reports)
+
+
+class FailsLater(OnlyLists):
+    def resume(self, reports: Reports, memory: Any) -> Any:
+        return self.fuse(reports), 1 / len(reports.issue_s)
+
+
 BROKEN = [
     (ChangesEntries, "inputs", "expected reports as before, found entries changed"),
     (ChangesWhatIsNewest, "inputs", "expected reports as before, found newest changed"),
@@ -349,6 +394,10 @@ BROKEN = [
     (SureOfWhatEnds, "causality", "without what arrives after 0.* s', run 0, instant 0.* s: existence: expected "),
     (ByWhatIsLost, "causality", "what arrives after .* s spoiled', run 0, instant .* s: z_m: expected 0 .*, found 1"),
     (AfterTheFact, "causality", r"without what arrives after (.*) s', run 0, instant \1 s: x_m: expected "),
+    (ForgetsOverACut, "stretches", "one unit; instants in stretches', run 0, instant .* s: z_m: expected 2 .* found 1"),
+    (ByTheOneBefore, "stretches", "'.*; instants in stretches', run 0, instant .* s: z_m: expected .*, found "),
+    (OnlyLists, "stretches", "in stretches': resume: expected Lists and a memory, found Lists"),
+    (FailsLater, "stretches", r"expected Lists and a memory of instants\[0:0\], found ZeroDivisionError: "),
     (ShareOfUnits, "unheard", "one unit; and a unit that is not heard', run 0, instant .* s: existence: expected "),
     (FirstOfEachList, "order of entries", "entries shuffled and tracks renumbered', run 0, instant .*: expected "),
     (ByTheUnitsNumbers, "order of entries", "renumbered', run 0, instant .*: expected . entries .*, found "),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -32,6 +32,24 @@ class Ideal(Fusion):
 class ListFusion(Fusion):
     """Base of fusions that go by lists without truth."""
 
+    resumable: ClassVar[bool] = False
+    """Whether `resume` gives, stretch after stretch of the instants, the very lists of `fuse`; if not, all instants are
+    handed over at once. Whoever overrides `fuse` has to say so anew."""
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        if "fuse" in vars(cls) and "resumable" not in vars(cls):
+            cls.resumable = False
+
+    @property
+    def looks_back_s(self) -> float:
+        """Which lists that arrived before a stretch it needs once more, beside those in `newest`.
+
+        Those captured at most so long before the newest capture that had arrived by then: the others have no entries.
+        It is from that capture that it counts, not from the stretch's first instant, since all lists may come late.
+        """
+        return 0.0
+
     @abstractmethod
     def fuse(self, reports: Reports) -> Lists:
         """One fused list per instant and run, `start (S, K + 1)`.
@@ -40,6 +58,15 @@ class ListFusion(Fusion):
         entries or units. Of its entries `captured_s` is the newest capture that contributed, `unit_ix` the first unit
         that did (−1: not said), `track_id` an identity over time (−1: the algorithm keeps none).
         """
+
+    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+        """The lists of the next stretch of instants, and what is to be remembered for the one after it.
+
+        Stretches are consecutive, and lists of units have the same numbers in all. `memory`: what the last call gave,
+        None at first; each is handed over once. As it stands here a fusion without memory is resumed: the list of an
+        instant depends on the lists in `newest` and `arrived` alone.
+        """
+        return self.fuse(reports), None
 
 
 @dataclass(frozen=True)
@@ -67,37 +94,62 @@ class Inbox:
 class StepFusion(ListFusion):
     """Base of fusions in plain Python: one instant at a time. Derive your own from this."""
 
+    resumable: ClassVar[bool] = True
+
     @abstractmethod
     def step(self, now_s: float, inbox: Inbox, memory: Any) -> tuple[Entries, Any]:
         """The fused list of this instant, and what is to be remembered until the next (`memory`: None at first)."""
 
     def fuse(self, reports: Reports) -> Lists:
         """Every run by itself, instant after instant."""
+        return self.resume(reports, None)[0]
+
+    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+        """The same at the next instants. What is remembered is of each run what its last step gave."""
         runs, instants = len(reports.lists.start), len(reports.issue_s)
         start = np.zeros((runs, instants + 1), dtype=np.int64)
         parts: list[Entries] = []
         total = 0
+        memories = [None] * runs if memory is None else list(memory)
         for s in range(runs):
-            memory: Any = None
             start[s, 0] = total
             for k in range(instants):
-                entries, memory = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memory)
+                entries, memories[s] = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memories[s])
                 if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY or entries.ndim != 1:
                     found = entries.dtype.name if isinstance(entries, np.ndarray) else type(entries).__name__
                     raise TypeError(f"step: expected a list (an array of ENTRY) and a memory, found {found}")
                 parts.append(entries)
                 total += len(entries)
                 start[s, k + 1] = total
-        return Lists(start, np.concatenate([reports.lists.entries[:0], *parts]))
+        return Lists(start, np.concatenate([reports.lists.entries[:0], *parts])), memories
 
 
 def fused_by(fusion: ListFusion, reports: Reports, where: str) -> Lists:
     """What a fusion gives, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
-    found = asked(fusion, where, lambda: fusion.fuse(reports))
+    return _checked(asked(fusion, where, lambda: fusion.fuse(reports)), fusion, reports, where)
+
+
+def resumed_by(fusion: ListFusion, reports: Reports, memory: Any, where: str) -> tuple[Lists, Any]:
+    """What a `resumable` fusion gives of the next stretch and remembers, checked as `fused_by` does."""
+    given = asked(fusion, where, lambda: fusion.resume(reports, memory))
+    if said := pair_problem(given):
+        raise InputError(f"{where}: {fusion.kind}: {said}")
+    found, memory = given
+    return _checked(found, fusion, reports, where), memory
+
+
+def _checked(found: Lists, fusion: ListFusion, reports: Reports, where: str) -> Lists:
     said = form_problem(found, reports) or content_problem(found, reports)
     if said is not None:
         raise InputError(f"{where}: {fusion.kind}: {said}")
     return found
+
+
+def pair_problem(given: object) -> str | None:
+    """What is wrong with the form of what `resume` gave; None: it is two things."""
+    if isinstance(given, tuple) and len(given) == 2:
+        return None
+    return f"resume: expected Lists and a memory, found {type(given).__name__}"
 
 
 def form_problem(found: object, reports: Reports) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -40,6 +40,8 @@ class Gnn(ListFusion):
     minimise: Literal["trace", "determinant"] = "trace"
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.99
     min_existence: Share = 0.0
+
+    resumable: ClassVar[bool] = True
 
     def fuse(self, reports: Reports) -> Lists:
         """Every run by itself."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -37,6 +37,8 @@ class Nms(ListFusion):
     iou: Share = 0.15
     radius_m: Positive = 2.0
     min_existence: Share = 0.2
+
+    resumable: ClassVar[bool] = True
 
     def fuse(self, reports: Reports) -> Lists:
         """Every run by itself."""

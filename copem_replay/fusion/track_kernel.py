@@ -19,6 +19,7 @@ from copem_replay.fusion.combine import floored
 from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.object_list import ENTRY, Entries
 from copem_replay.fusion.track_filter import distance2, predict, update
+from copem_replay.fusion.track_memory import CLAIM, TRACK, Memory, Remembered, recalled, remembered
 from copem_replay.tracks import CLASSES, SAME_INSTANT_NS, Bool, Float, Int
 
 STALE, PREDICT, REPLAY = 0, 1, 2
@@ -30,38 +31,6 @@ freedom (chosen), so half of the pairs of entries of one object are closer."""
 _SAME_S = SAME_INSTANT_NS * 1e-9
 _LEAST_COST = 1e-6
 """What the worst pair within the gate is better than none (chosen: small against the differences between pairs)."""
-
-TRACK = np.dtype(
-    [
-        ("state", "f8", (4,)),  # x, y, vx, vy at `at_s`
-        ("P", "f8", (4, 4)),
-        ("at_s", "f8"),
-        ("ee", "f8"), ("en", "f8"), ("nn", "f8"),  # R of the entry heard last
-        ("z_m", "f8"),  # z and yaw of the newest entry
-        ("yaw_rad", "f8"),
-        ("length_m", "f8"),  # sums over all entries, sizes and class
-        ("width_m", "f8"),
-        ("height_m", "f8"),
-        ("class_probability", "f8", (len(CLASSES),)),
-        ("class_ix", "i8"),  # the most probable
-        ("count", "i8"),  # of entries
-        ("first_s", "f8"),  # captures of the first and the last list in support
-        ("last_s", "f8"),
-        ("unit_ix", "i8"),  # who founded it
-        ("track_id", "i8"),
-    ]
-)  # fmt: skip
-CLAIM = np.dtype([("existence", "f8"), ("at_s", "f8")])
-"""The newest thing a unit said of a track, and since when that fades: its capture (`stale`: when it was heard). Nothing
-yet: 0, −inf."""
-
-
-class Memory(NamedTuple):
-    """What is remembered from one instant to the next; tracks stand in the order in which they were founded."""
-
-    tracks: NDArray[Any]  # (T,) of TRACK
-    claims: NDArray[Any]  # (T, U) of CLAIM
-    together_s: Float  # (T, T) when one list last held both; −inf: never
 
 
 class Said(NamedTuple):
@@ -95,13 +64,10 @@ class Rules(NamedTuple):
 
 @nb.njit(cache=True, nogil=True)
 def fuse_run(
-    said: Said, rules: Rules, units: int, issue_s: Float, arrived: Int, arrived_start: Int
-) -> tuple[Int, Entries]:
-    """Fused lists of one run: where each begins (K + 1,), and their entries."""
-    memory = Memory(np.empty(0, TRACK), np.empty((0, units), CLAIM), np.empty((0, 0)))
-    before = [memory]  # replay: memory before each of the lists `heard`
-    before.pop()
-    heard = np.empty(0, np.int64)
+    said: Said, rules: Rules, so_far: Remembered, issue_s: Float, arrived: Int, arrived_start: Int
+) -> tuple[Int, Entries, Remembered]:
+    """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and what to remember."""
+    memory, before, heard = recalled(so_far, said.captured_s)
     start, entries = np.zeros(len(issue_s) + 1, np.int64), np.zeros(256, ENTRY)
     for k in range(len(issue_s)):
         came = _in_order(said, arrived[arrived_start[k] : arrived_start[k + 1]])
@@ -116,7 +82,7 @@ def fuse_run(
             grown[: start[k]] = entries[: start[k]]
             entries = grown
         start[k + 1] = start[k] + _publish(memory, rules, issue_s[k], entries[start[k] :])
-    return start, entries[: start[-1]].copy()
+    return start, entries[: start[-1]].copy(), remembered(memory, before, heard, said.captured_s)
 
 
 @nb.njit(cache=True, nogil=True)

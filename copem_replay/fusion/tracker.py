@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,6 +15,7 @@ from copem_replay.fusion.component import ListFusion
 from copem_replay.fusion.content_order import rows_in_order
 from copem_replay.fusion.object_list import ENTRY, Lists, Reports
 from copem_replay.fusion.track_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
+from copem_replay.fusion.track_memory import Remembered, nothing_yet
 from copem_replay.fusion.union import run_after_run
 from copem_replay.resample import wrap
 from copem_replay.tracks import Float, Int
@@ -64,20 +66,31 @@ class Tracker(ListFusion):
             raise ValueError(f"drop: expected at most publish ({self.publish}), found {self.drop}")
         return self
 
+    resumable: ClassVar[bool] = True
+
+    @property
+    def looks_back_s(self) -> float:
+        """How far back lists are heard again."""
+        return self.buffer_s if self.late == "replay" else 0.0
+
     def fuse(self, reports: Reports) -> Lists:
         """Every run by itself, instant after instant."""
+        return self.resume(reports, None)[0]
+
+    def resume(self, reports: Reports, memory: Sequence[Remembered] | None) -> tuple[Lists, Sequence[Remembered]]:
+        """The same at the next instants. What is remembered is of each run its tracks."""
         rules = Rules(
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
             self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
         )  # fmt: skip
         arrived, start = _gone_by(reports) if self.late == "stale" else (reports.arrived, reports.arrived_start)
+        so_far = memory or [nothing_yet(len(reports.units))] * len(reports.lists.start)
         runs = [
-            fuse_run(_said(reports, s), rules, len(reports.units), reports.issue_s, arrived, start)
-            for s in range(len(reports.lists.start))
+            fuse_run(_said(reports, s), rules, one, reports.issue_s, arrived, start) for s, one in enumerate(so_far)
         ]
-        fused = run_after_run(runs, len(reports.issue_s))
+        fused = run_after_run([(starts, entries) for starts, entries, _ in runs], len(reports.issue_s))
         fused.entries["yaw_rad"] = wrap(fused.entries["yaw_rad"])
-        return fused
+        return fused, [one for _, _, one in runs]
 
 
 def _gone_by(reports: Reports) -> tuple[Int, Int]:

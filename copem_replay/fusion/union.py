@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numba as nb
 import numpy as np
@@ -22,6 +22,8 @@ class Union(ListFusion):
 
     kind: Literal["union"] = "union"
     min_existence: Share = 0.0
+
+    resumable: ClassVar[bool] = True
 
     def fuse(self, reports: Reports) -> Lists:
         """Every run by itself."""
