@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from copem_replay.accuracy import Accuracy, Settings, for_runs
-from copem_replay.assess import assess
+from copem_replay.assess import Assessment
 from copem_replay.believe import Believed
 from copem_replay.detect import Detections
 from copem_replay.experiment import Experiment
 from copem_replay.fusion.agree import AGREE
 from copem_replay.match import Matches, match
-from copem_replay.matched import Steps, captures_of, first_matches
+from copem_replay.matched import FirstMatches, Steps, captures_of
 from copem_replay.measure_keys import Measure
 from copem_replay.onset import Looks, Reference, measured_objects, reference_at
-from copem_replay.resample import at_instants
+from copem_replay.resample import AROUND_S, at_instants
 from copem_replay.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
 
 
@@ -36,7 +36,10 @@ class Surroundings:
         if key not in self._worlds:
             stamps = self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
             gap_s = self.experiment.max_gap_s
-            self._worlds[key] = at_instants(self.truth, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
+            near = self.truth
+            if len(time_s):
+                near = near.captured_between(time_s[0] - gap_s - AROUND_S, time_s[-1] + gap_s + AROUND_S)
+            self._worlds[key] = at_instants(near, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
         return self._worlds[key]
 
     def reference(self, time_s: Float) -> Reference:
@@ -73,7 +76,6 @@ class Appraisal:
     """
 
     issue_s: Float
-    matches: Matches
     detections: Detections
     steps: Steps
     accuracy: Accuracy | None
@@ -84,24 +86,50 @@ def match_lists(around: Surroundings, believed: Believed, measure: Measure) -> M
     return match(believed.lists, around.at(believed.at.issue_s), around.scene, gate_m=measure.match.gate_m)
 
 
-def appraise(around: Surroundings, looks: Looks, believed: Believed, measure: Measure, runs: int) -> Appraisal:
-    """Match a configuration's lists in so many runs with the truth, and measure them."""
-    issue_s = believed.at.issue_s
-    matches = match_lists(around, believed, measure)
-    detections, steps = first_matches(
-        believed.lists, matches, issue_s, looks,
-        confirm=measure.confirm, count_earlier=measure.count_earlier, captures=captures_of(believed.heard),
-    )  # fmt: skip
-    accuracy = None
-    if measure.accuracy:
-        captures: Float = np.unique(believed.heard.captured_s)
-        assessed = assess(
-            believed.lists, matches, issue_s, around.at(issue_s), around.at(captures), around.scene, looks,
-            around.since_s(looks), around.reference(issue_s),
-            around.classes(measure), settings=settings_of(measure, around.scene.end_s),
+class Appraiser:
+    """Measures a configuration's lists, stretch by stretch; `issue_s (K,)`: when all of the log's are available."""
+
+    def __init__(
+        self, around: Surroundings, looks: Looks, believed: Believed, issue_s: Float, measure: Measure
+    ) -> None:
+        self._issue_s, self._measure = issue_s, measure
+        runs = len(believed.lists.start)
+        self._known = FirstMatches(
+            looks, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
+            captures=captures_of(believed.heard),
         )  # fmt: skip
-        accuracy = for_runs(assessed, runs)
-    return Appraisal(issue_s, matches, detections, steps, accuracy)
+        self._captures: Float = np.unique(believed.heard.captured_s)
+        self._assessment = None
+        if measure.accuracy:
+            self._assessment = Assessment(
+                issue_s, around.scene, looks, around.since_s(looks), around.reference(issue_s),
+                around.classes(measure), settings=settings_of(measure, around.scene.end_s), runs=runs,
+            )  # fmt: skip
+
+    def add(self, around: Surroundings, believed: Believed) -> Matches:
+        """Take in the lists of a stretch; what they are about."""
+        matches = match_lists(around, believed, self._measure)
+        lists, issue_s = believed.lists, believed.at.issue_s
+        self._known.add(lists, matches, issue_s)
+        if self._assessment is not None:
+            whole = len(issue_s) == len(self._issue_s)
+            captures = self._captures if whole else self._next_to(lists.entries["captured_s"])
+            self._assessment.add(lists, matches, around.at(issue_s), around.at(captures))
+        return matches
+
+    def _next_to(self, captured_s: Float) -> Float:
+        """The captures that are next to instants (N,), before and after."""
+        after = np.searchsorted(self._captures, captured_s)
+        used = np.zeros(len(self._captures) + 1, dtype=bool)
+        used[after] = used[np.maximum(after - 1, 0)] = True
+        return self._captures[used[:-1]]
+
+    def result(self, runs: int) -> Appraisal:
+        """All of it, for each of so many runs."""
+        detections, steps = self._known.result()
+        assessment = self._assessment
+        accuracy = None if assessment is None else for_runs(assessment.result(), runs)
+        return Appraisal(self._issue_s, detections, steps, accuracy)
 
 
 DISTANCE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,14 +14,15 @@ from copem_replay.chance import Address, Dice, object_words
 from copem_replay.experiment import Configuration, Experiment
 from copem_replay.fusion.as_lists import as_lists
 from copem_replay.fusion.belief import Belief
-from copem_replay.fusion.component import Ideal, ListFusion, fused_by
+from copem_replay.fusion.component import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.instants import Instants, instants
 from copem_replay.fusion.object_list import Lists
 from copem_replay.fusion.reports import Claims, lists_without_truth, reports
 from copem_replay.perceive import perceive
 from copem_replay.recorded import RecordedUnits
-from copem_replay.tracks import CLASSES, TRUTH, Bool, Int, Scene, Tracks, joined
+from copem_replay.stretches import WHOLE, Stretch
+from copem_replay.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.transmit import transmit
 
 States = Literal["true", "expected", "sampled"]
@@ -29,10 +30,10 @@ States = Literal["true", "expected", "sampled"]
 
 @dataclass(frozen=True)
 class World:
-    """One log as the units of an experiment have it: what of it is the same in all runs.
+    """One log, or a stretch of one, as the units of an experiment have it: what of it is the same in all runs.
 
     `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
-    unit per carrier.
+    unit per carrier. What was captured before the stretch and is needed in it is there, too.
     """
 
     scene: Scene
@@ -40,11 +41,12 @@ class World:
     found: Candidates
     recorded: RecordedUnits | None
     experiment: Experiment
+    stretch: Stretch = WHOLE
 
 
 @dataclass(frozen=True)
 class Believed:
-    """What one configuration's receiver believes in the runs (S,).
+    """What one configuration's receiver believes in the runs (S,) at its instants, `at`.
 
     `belief`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without truth ids,
     or what another fusion gave; one run where all runs agree.
@@ -103,39 +105,66 @@ def by_truth(configuration: Configuration) -> bool:
     return configuration.units == TRUTH or isinstance(configuration.fusion, Ideal)
 
 
-def believe(world: World, runs: Int, there: Bool | None) -> Iterator[tuple[str, Believed]]:
-    """What each configuration's receiver believes in the runs (S,), of the units that are `there (U,)`.
+class Receivers:
+    """The receivers of all configurations, of the units that are `there (U,)`, and what they remember.
 
-    Raises InputError where a fusion of the user's own fails.
+    Stretches of one log are believed one after the other, in order of time.
     """
-    ego_ix, experiment = world.scene.ego_ix, world.experiment
-    seen: dict[States, Tracks] = {}  # each is made when first needed
-    without_truth: list[Lists] = []
 
-    def seen_in(states: States) -> Tracks:
-        if states not in seen:
-            seen[states] = seen_by_all(world, runs, states=states)
-        return seen[states]
+    def __init__(self, runs: Int, there: Bool | None) -> None:
+        self._runs, self._there = runs, there
+        self._instants: dict[str, Instants] = {}
+        self._memory: dict[str, Any] = {}
 
-    for name, configuration in experiment.configurations.items():
-        fusion, of_truth = configuration.fusion, configuration.units == TRUTH
-        if isinstance(fusion, ListFusion):
-            heard = listen(seen_in("sampled"), world.truth, experiment, configuration, there)
-            if not without_truth:
-                without_truth.append(_without_truth(world, seen_in("sampled"), runs))
-            told = reports(heard, without_truth[0], max_age_s=configuration.max_age_s)
-            fused = fused_by(fusion, told, f"configurations.{name}.fusion")
-            yield name, Believed(heard, instants(heard, max_age_s=configuration.max_age_s), None, world.scene, fused)
-            continue
-        assert isinstance(fusion, Ideal)
-        posterior = fusion.combine == "posterior" and not of_truth
-        heard = listen(seen_in("expected" if posterior else "sampled"), world.truth, experiment, configuration, there)
-        belief = fuse(heard, max_age_s=configuration.max_age_s, without_object_ix=ego_ix)
-        if not of_truth and world.recorded is None:
-            belief = replace(belief, look=world.found.look)
-        if posterior:
-            belief = draw_posterior(belief, world.scene, experiment.seed, runs)
-        yield name, Believed(heard, instants(heard, max_age_s=configuration.max_age_s), belief, world.scene, None)
+    def issue_s(self, name: str) -> Float:
+        """(K,) all instants of a configuration's receiver, when it has been heard of."""
+        return self._instants[name].issue_s
+
+    def believe(self, world: World) -> Iterator[tuple[str, Believed]]:
+        """What each configuration's receiver believes in the runs (S,), in the stretch.
+
+        Raises InputError where a fusion of the user's own fails.
+        """
+        experiment = world.experiment
+        seen: dict[States, Tracks] = {}  # each is made when first needed
+        without_truth: list[Lists] = []
+
+        def seen_in(states: States) -> Tracks:
+            if states not in seen:
+                seen[states] = seen_by_all(world, self._runs, states=states)
+            return seen[states]
+
+        for name, configuration in experiment.configurations.items():
+            fusion, of_truth = configuration.fusion, configuration.units == TRUTH
+            max_age_s = configuration.max_age_s
+            posterior = isinstance(fusion, Ideal) and fusion.combine == "posterior" and not of_truth
+            states: States = "expected" if posterior else "sampled"
+            heard = listen(seen_in(states), world.truth, experiment, configuration, self._there)
+            if name not in self._instants:
+                self._instants[name] = instants(heard, max_age_s=max_age_s)
+            at = self._instants[name].between(world.stretch.from_s, world.stretch.until_s)
+            if isinstance(fusion, ListFusion):
+                if not without_truth:
+                    without_truth.append(_without_truth(world, seen_in("sampled"), self._runs))
+                told = reports(heard, without_truth[0], max_age_s=max_age_s, at=at)
+                where = f"configurations.{name}.fusion"
+                if fusion.resumable:
+                    fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
+                else:  # such a log is one stretch
+                    fused = fused_by(fusion, told, where)
+                yield name, Believed(heard, at, None, world.scene, fused)
+                continue
+            belief = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
+            if not of_truth and world.recorded is None:
+                belief = replace(belief, look=world.found.look)
+            if posterior:
+                belief = draw_posterior(belief, world.scene, experiment.seed, self._runs)
+            yield name, Believed(heard, at, belief, world.scene, None)
+
+
+def believe(world: World, runs: Int, there: Bool | None) -> Iterator[tuple[str, Believed]]:
+    """What each configuration's receiver believes of a whole log."""
+    return Receivers(runs, there).believe(world)
 
 
 def _without_truth(world: World, seen: Tracks, runs: Int) -> Lists:

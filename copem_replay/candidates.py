@@ -5,7 +5,9 @@ Nothing here depends on the run, on a model's parameters or on a configuration: 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,18 +15,10 @@ from copem_replay.experiment import Experiment
 from copem_replay.pem.condition import applies
 from copem_replay.pem.detection import probability_of
 from copem_replay.pem.look import Look
-from copem_replay.resample import at_instants, wrap
-from copem_replay.tracks import VALUES, Float, Int, Scene, Tracks, joined
-from copem_replay.units import (
-    Poses,
-    carrier,
-    list_instants,
-    observers,
-    place_obstacles,
-    poses,
-    unit_ground,
-)
-from copem_replay.visibility import Statics, visible_shares
+from copem_replay.resample import AROUND_S, at_instants, wrap
+from copem_replay.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
+from copem_replay.units import Placed, Poses, observers, place
+from copem_replay.visibility import visible_shares
 
 
 @dataclass(frozen=True)
@@ -32,8 +26,7 @@ class Candidates:
     """True states of all candidate rows (one run), how they look, and with which probability they are listed.
 
     `couple_ix (P,)`: the couple of the unit's PEM that applies, −1: none. `probability (P,)`, and `existence (P,)` as
-    the unit claims it of what it lists.
-    `poses` and the lists of each unit are in the experiment's order.
+    the unit claims it of what it lists. The units and their lists are in the experiment's order.
     """
 
     tracks: Tracks
@@ -41,49 +34,72 @@ class Candidates:
     couple_ix: Int
     probability: Float
     existence: Float
-    poses: dict[str, Poses]
-    static: Statics
-    notes: tuple[str, ...]
 
     def of_objects(self, object_ix: Int) -> Candidates:
         """Only the rows of some objects: for what concerns each object by itself."""
-        tracks = np.isin(self.tracks.object_ix, object_ix)
-        rows = np.flatnonzero(tracks[self.tracks.track_ix])
-        return replace(
-            self,
-            tracks=self.tracks.take_tracks(tracks),
-            look=self.look.take(rows),
-            couple_ix=self.couple_ix[rows],
-            probability=self.probability[rows],
-            existence=self.existence[rows],
+        of_track = np.isin(self.tracks.object_ix, object_ix)
+        return self if of_track.all() else self.take_rows(np.flatnonzero(of_track[self.tracks.track_ix]))
+
+    def take_rows(self, rows: Int) -> Candidates:
+        """Only some rows, ascending (K,)."""
+        return Candidates(
+            self.tracks.take_rows(rows),
+            self.look.take(rows),
+            self.couple_ix[rows],
+            self.probability[rows],
+            self.existence[rows],
         )
 
+    @property
+    def ever_met(self) -> Bool:
+        """(U,) whether a condition of each unit's PEM is met by any object here."""
+        met = np.bincount(self.tracks.row_unit_ix[self.couple_ix >= 0], minlength=len(self.tracks.units)) > 0
+        return np.asarray(met)
 
-def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidates:
-    """All candidate rows of an experiment's units over one log (`truth`: the world at its own frames)."""
-    notes: list[str] = []
-    static = place_obstacles(truth, experiment.obstacles, notes)
-    worlds: dict[bytes, tuple[Tracks, list[str]]] = {}
-    for name, unit in experiment.modelled.items():
-        stamps = list_instants(scene, truth, unit)
-        if stamps.tobytes() not in worlds:
-            world = truth if unit.rate_hz is None else _world(scene, truth, stamps, experiment.max_gap_s)
-            worlds[stamps.tobytes()] = (world, [])
-        worlds[stamps.tobytes()][1].append(name)
-    unit_poses: dict[str, Poses] = {}
+
+def joined_stretches(pieces: Sequence[Candidates]) -> Candidates:
+    """Rows of stretches that follow each other, as of one."""
+    if len(pieces) == 1:
+        return pieces[0]
+    tracks, order = spliced([piece.tracks for piece in pieces])
+
+    def rows(columns: Sequence[Any]) -> Any:
+        return np.concatenate(columns)[order]
+
+    look = Look(**{f: rows([getattr(piece.look, f) for piece in pieces]) for f in Look.__dataclass_fields__})
+    more = (rows([getattr(piece, f) for piece in pieces]) for f in ("couple_ix", "probability", "existence"))
+    return Candidates(tracks, look, *more)
+
+
+def candidates(
+    scene: Scene,
+    truth: Tracks,
+    experiment: Experiment,
+    placed: Placed | None = None,
+    *,
+    from_s: float = -np.inf,
+    until_s: float = np.inf,
+) -> Candidates:
+    """All candidate rows of an experiment's units over one log (`truth`: the world at its own frames).
+
+    Of a stretch only the rows captured from an instant on and before another; lists are always all there. `placed`:
+    where the units are, None: to be found out.
+    """
+    if placed is None:
+        placed = place(scene, truth, experiment)
+    together: dict[bytes, list[str]] = {}
+    for name, stamps in placed.stamps_ns.items():
+        together.setdefault(stamps.tobytes(), []).append(name)
     pieces: dict[str, tuple[Tracks, Look]] = {}
-    for world, names in worlds.values():
-        for name in names:
-            unit = experiment.units[name]
-            unit_poses[name] = poses(scene, unit, world, unit_ground(truth, name, unit, notes))
-        carriers = np.array([carrier(scene, experiment.units[name]) for name in names])
-        places = [unit_poses[name] for name in names]
-        shares = visible_shares(
-            world,
-            static,
-            observers(places, carriers),
-            flat=experiment.visibility == "flat",
-        )
+    for names in together.values():
+        own_rate = experiment.units[names[0]].rate_hz is not None
+        world = truth.captured_between(from_s, until_s)
+        if own_rate:
+            world = _world(scene, truth, placed.stamps_ns[names[0]], experiment.max_gap_s, from_s, until_s)
+        places = [placed.poses[name] for name in names]
+        carriers = np.array([placed.carrier_ix[name] for name in names])
+        flat = experiment.visibility == "flat"
+        shares = visible_shares(world, placed.static, observers(places, carriers), flat=flat)
         for k, name in enumerate(names):
             pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
     ordered = [pieces[name] for name in experiment.modelled]
@@ -95,17 +111,15 @@ def candidates(scene: Scene, truth: Tracks, experiment: Experiment) -> Candidate
         }
     )
     look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
-    couple_ix, probability, existence = _assess(tracks, look, experiment)
-    for k, name in enumerate(experiment.modelled):
-        if not (tracks.frame_unit_ix == k).any():
-            notes.append(f"unit {name}: makes no list, its carrier is never there")
-        elif not (couple_ix[tracks.row_unit_ix == k] >= 0).any():
-            notes.append(f"unit {name}: no object ever meets a condition of its PEM {experiment.units[name].pem!r}")
-    return Candidates(tracks, look, couple_ix, probability, existence, unit_poses, static, tuple(notes))
+    return Candidates(tracks, look, *_assess(tracks, look, experiment))
 
 
-def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float) -> Tracks:
-    return at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
+def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float, from_s: float, until_s: float) -> Tracks:
+    """The world at a unit's list instants."""
+    around_s = max_gap_s + AROUND_S
+    near = truth.captured_between(from_s - around_s, until_s + around_s)
+    world = at_instants(near, stamps, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
+    return world.captured_between(from_s, until_s)
 
 
 def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple[Tracks, Look]:

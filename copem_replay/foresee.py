@@ -24,33 +24,58 @@ _PIECES = 500
 """More pieces than this are not made: they are longer then (chosen: a kilometre)."""
 
 
-def foreseen(
-    belief: Belief, ego: EgoCourse, found: Looks, wanted: Conflict, *, confirm: Confirm, count_earlier: bool
-) -> Float:
-    """(S, M) when the receiver first has a list (`hits` of its last `of` lists) that implies a collision; NaN: never.
+class Foreseeing:
+    """When the receiver first has a list (`hits` of its last `of` lists) that implies a collision, look by look.
 
     As with detections, a list counts when something at or after the onset contributed to what it says of the object.
+    Stretches of a log are added one after the other.
     """
-    fused = belief.fused
-    issue_s = fused.arrives_s[0]
-    pieces, bounds = corridors(ego, issue_s, wanted)
-    implied = np.zeros(fused.valid.shape, dtype=np.bool_)
-    columns = (fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
-    _implied(fused.valid, *columns, fused.frame_ix, pieces, bounds, wanted.horizon_s, implied)
-    newest_s = belief.captured_s
-    result = np.full((len(fused.valid), len(found.object_ix)), np.nan)
-    track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
-    for m, object_ix in enumerate(found.object_ix):
-        if int(object_ix) not in track_of:
-            continue
-        track = track_of[int(object_ix)]
-        rows = slice(int(fused.start[track]), int(fused.start[track + 1]))
-        counts = implied[:, rows].copy()
-        if not count_earlier:
-            counts &= newest_s[:, rows] >= found.onset_s[m] - _TOLERANCE_S
-        counts &= issue_s[fused.frame_ix[rows]] <= found.ended_s[m] + _TOLERANCE_S
-        _first_confirmed(counts, fused.frame_ix[rows], issue_s, confirm.hits, confirm.of, result[:, m])
-    return result
+
+    def __init__(self, ego: EgoCourse, found: Looks, wanted: Conflict, *, confirm: Confirm, count_earlier: bool):
+        self._ego, self._found, self._wanted, self._confirm = ego, found, wanted, confirm
+        never = np.full(len(found.object_ix), -np.inf)
+        self._not_before_s = never if count_earlier else found.onset_s - _TOLERANCE_S
+        self._lists, self._issue_s = 0, [np.empty(0)]
+        self._held: dict[tuple[int, int], list[Int]] = {}  # by run and look: lists that imply one
+
+    def add(self, belief: Belief, first_run: int = 0) -> None:
+        """Take in what is believed in runs (S,), `first_run` and those that follow; several of one stretch may be."""
+        fused = belief.fused
+        issue_s = fused.arrives_s[0]
+        pieces, bounds = corridors(self._ego, issue_s, self._wanted)
+        implied = np.zeros(fused.valid.shape, dtype=np.bool_)
+        columns = (fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
+        _implied(fused.valid, *columns, fused.frame_ix, pieces, bounds, self._wanted.horizon_s, implied)
+        newest_s = belief.captured_s
+        track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
+        for m, object_ix in enumerate(self._found.object_ix.tolist()):
+            if object_ix not in track_of:
+                continue
+            track = track_of[object_ix]
+            rows = slice(int(fused.start[track]), int(fused.start[track + 1]))
+            counts = implied[:, rows] & (newest_s[:, rows] >= self._not_before_s[m])
+            counts &= issue_s[fused.frame_ix[rows]] <= self._found.ended_s[m] + _TOLERANCE_S
+            for s in np.flatnonzero(counts.any(axis=1)).tolist():
+                held = self._lists + fused.frame_ix[rows][counts[s]]
+                self._held.setdefault((first_run + s, m), []).append(held)
+
+    def next(self, issue_s: Float) -> None:
+        """Done with a stretch, whose lists were available at `issue_s (K,)`."""
+        self._issue_s.append(issue_s)
+        self._lists += len(issue_s)
+
+    def result(self, runs: int) -> Float:
+        """(S, M) when that was; NaN: never."""
+        issue_s = np.concatenate(self._issue_s)
+        first_s = np.full((runs, len(self._found.object_ix)), np.nan)
+        hits, of = self._confirm.hits, self._confirm.of
+        for (s, m), parts in self._held.items():
+            held = np.concatenate(parts)
+            # So many lists before it hold it too, that list among them, within the last `of`.
+            enough = np.flatnonzero(held[hits - 1 :] - held[: max(len(held) - hits + 1, 0)] < of)
+            if len(enough):
+                first_s[s, m] = issue_s[held[enough[0] + hits - 1]]
+        return first_s
 
 
 def corridors(ego: EgoCourse, now_s: Float, wanted: Conflict) -> tuple[Float, Int]:
@@ -144,19 +169,3 @@ def _will_be_in(
         if first > last:
             return False
     return True
-
-
-@nb.njit(cache=True, nogil=True)
-def _first_confirmed(counts: Bool, frame_ix: Int, issue_s: Float, hits: int, of: int, out: Float) -> None:
-    for s in range(counts.shape[0]):
-        for p in range(counts.shape[1]):
-            if not counts[s, p]:
-                continue
-            held = 0
-            for q in range(p, -1, -1):
-                if frame_ix[q] <= frame_ix[p] - of:
-                    break
-                held += counts[s, q]
-            if held >= hits:
-                out[s] = issue_s[frame_ix[p]]
-                break

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,23 @@ class RecordedUnits:
     existence: Float
     class_probability: Float  # (P, C)
     track_id: Int
+
+    @cached_property
+    def _by_capture(self) -> tuple[Int, Float]:
+        """Rows in order of capture (P,), and when that was (P,)."""
+        order = np.argsort(self.tracks.row_captured_s, kind="stable")
+        return order, self.tracks.row_captured_s[order]
+
+    def captured_between(self, from_s: float, until_s: float) -> RecordedUnits:
+        """Only rows captured from an instant on and before another; all lists stay."""
+        order, captured_s = self._by_capture
+        first, after = np.searchsorted(captured_s, (from_s, until_s))
+        if first == 0 and after == len(order):
+            return self
+        rows = np.sort(order[first:after])
+        return RecordedUnits(
+            self.tracks.take_rows(rows), self.existence[rows], self.class_probability[rows], self.track_id[rows]
+        )
 
 
 def recorded_unit(

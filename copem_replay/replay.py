@@ -4,23 +4,24 @@ function of it, so that blocks can be computed anywhere, in any order, by any nu
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.appraise import Appraisal, Surroundings, appraise, match_lists
-from copem_replay.believe import Believed, World, believe, by_truth, listen, seen_by_all
+from copem_replay.appraise import Appraisal, Appraiser, Surroundings, match_lists
+from copem_replay.believe import Believed, Receivers, World, by_truth, listen, seen_by_all
 from copem_replay.braking.course import EgoCourse
 from copem_replay.braking.encounter import Encounter, encounters
 from copem_replay.braking.verdict import passing
-from copem_replay.candidates import Candidates, candidates
+from copem_replay.candidates import Candidates, candidates, joined_stretches
 from copem_replay.detect import detect
 from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
 from copem_replay.fleet import Fleet, fleet_of
-from copem_replay.foresee import foreseen
+from copem_replay.foresee import Foreseeing
 from copem_replay.fusion.as_lists import as_belief
 from copem_replay.fusion.belief import Belief
 from copem_replay.fusion.instants import instants
@@ -29,7 +30,9 @@ from copem_replay.onset import Looks, looks
 from copem_replay.read import Recording
 from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
-from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.stretches import ROWS_A_STRETCH, WHOLE, Reach, Stretch, stretches
+from copem_replay.tracks import Bool, Float, Int, Scene, Tracks, spliced
+from copem_replay.units import Placed, place
 
 BLOCK_BYTES = 200_000_000
 """How much a block may hold (chosen)."""
@@ -48,8 +51,8 @@ class Replay:
     scene: Scene
     fleet: Fleet  # the experiment's units over this log
     truth: Tracks  # the world at its own frames, short gaps filled
-    found: Candidates
-    measured: Candidates  # the rows of objects that are looked at
+    placed: Placed
+    stretches: tuple[Stretch, ...]
     recorded: RecordedUnits | None
     looks: Looks
     encounters: tuple[Encounter, ...]  # those in conflict
@@ -72,10 +75,64 @@ class Replay:
         """The truth at the instants of fused lists, each computed once."""
         return Surroundings(self.scene, self.truth, self.fleet.experiment)
 
-    def world(self, experiment: Experiment, *, measured_only: bool = False) -> World:
-        """The log as the units of an experiment have it, by configuration: all of it, or what is looked at."""
-        found = self.measured if measured_only else self.found
-        return World(self.scene, self.truth, found, self.recorded, fleet_of(experiment, self.scene).experiment)
+    @cached_property
+    def _whole(self) -> Candidates:
+        return candidates(self.scene, self.truth, self.fleet.experiment, self.placed)
+
+    @cached_property
+    def measured(self) -> Candidates:
+        """The rows of objects that are looked at."""
+        return self.rows_of(self.looks.object_ix)
+
+    def rows_of(self, object_ix: Int) -> Candidates:
+        """The candidate rows of some objects."""
+        return joined_stretches([self.found(stretch).of_objects(object_ix) for stretch in self.stretches])
+
+    def found(self, stretch: Stretch, from_s: float | None = None) -> Candidates:
+        """The candidate rows captured in a stretch, or since an earlier instant. Those of a whole log are kept."""
+        if stretch == WHOLE:
+            return self._whole
+        return candidates(
+            self.scene,
+            self.truth,
+            self.fleet.experiment,
+            self.placed,
+            from_s=stretch.from_s if from_s is None else from_s,
+            until_s=stretch.until_s,
+        )
+
+    def world(self, experiment: Experiment) -> World:
+        """The log as the units of an experiment have it, by configuration."""
+        return World(self.scene, self.truth, self._whole, self.recorded, fleet_of(experiment, self.scene).experiment)
+
+    def worlds(self, experiment: Experiment, there: Bool | None) -> Iterator[World]:
+        """The same stretch by stretch, for receivers of the units that are `there (U,)`."""
+        if self.stretches == (WHOLE,):
+            yield self.world(experiment)
+            return
+        lists = self.lists_only(experiment)
+        units, seen = lists.experiment, seen_by_all(lists, np.arange(1), states="true")
+        reach = Reach(
+            units, {name: listen(seen, lists.truth, units, c, there) for name, c in units.configurations.items()}
+        )
+        for stretch in self.stretches:
+            earliest_s = reach.earliest_s(stretch.from_s)
+            yield World(
+                self.scene,
+                self.truth.captured_between(earliest_s, stretch.until_s),
+                self.found(stretch, earliest_s),
+                None if self.recorded is None else self.recorded.captured_between(earliest_s, stretch.until_s),
+                units,
+                stretch,
+            )
+
+    def lists_only(self, experiment: Experiment) -> World:
+        """The same without what is in the lists."""
+        none = np.empty(0, dtype=np.int64)
+        found = candidates(self.scene, self.truth, self.fleet.experiment, self.placed, from_s=np.inf)
+        recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
+        units = fleet_of(experiment, self.scene).experiment
+        return World(self.scene, self.truth.take_rows(none), found, recorded, units)
 
 
 @dataclass(frozen=True)
@@ -86,6 +143,7 @@ class Outcome:
     runs: Int
     table: pd.DataFrame
     appraisals: dict[str, Appraisal]
+    met: Bool  # (U,) whether any object ever met a condition of each unit's PEM
 
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
@@ -100,20 +158,24 @@ def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experime
                 raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
     fleet = fleet_of(experiment, scene)
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    found = candidates(scene, truth, fleet.experiment)
+    placed = place(scene, truth, fleet.experiment)
     recorded = recorded_units(
         recording.lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
-    on = looks(scene, truth, found.static, onsets_of or experiment)
+    on = looks(scene, truth, placed.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)
-    return Replay(scene, fleet, truth, found, found.of_objects(on.object_ix), recorded, on, meeting)
+    cut = stretches(scene, truth, fleet.experiment)
+    return Replay(scene, fleet, truth, placed, cut, recorded, on, meeting)
 
 
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
     """The runs cut into blocks, small enough for memory and enough of them for the workers."""
     states = _needs_all(experiment) or experiment.measure.conflict is not None
-    candidate_rows = replay.found if _needs_all(experiment) else replay.measured
-    rows = max(len(candidate_rows.tracks.frame_ix), 1)
+    if len(replay.stretches) > 1:
+        rows = ROWS_A_STRETCH
+    else:
+        found = replay.found(WHOLE) if _needs_all(experiment) else replay.measured
+        rows = max(len(found.tracks.frame_ix), 1)
     even = -(-experiment.runs // jobs)
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
     small = max(-(-even // 8), WORTH_A_BLOCK // rows)
@@ -150,37 +212,83 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
 def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None) -> Outcome:
     """What runs (S,) give: `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
     measure = experiment.measure
-    everything = _needs_all(experiment)
-    events = _by_truth_id(replay, experiment, runs, equipped, there)
+    met = np.zeros(len(replay.placed.poses), dtype=bool)
+    events = _by_truth_id(replay, experiment, runs, equipped, there, met)
     appraisals: dict[str, Appraisal] = {}
-    if everything or measure.conflict is not None:
-        world = replay.world(experiment, measured_only=not everything)
-        for name, believed in believe(world, runs, there):
-            appraisal = None
-            if everything:
-                appraisal = appraise(replay.surroundings, replay.looks, believed, measure, len(runs))
-                if name not in events or measure.match.always:
-                    events[name] = Events(believed.heard.units, appraisal.detections)
+    if _needs_all(experiment) or measure.conflict is not None:
+        receivers = Receivers(runs, there)
+        judges: dict[str, _Judge] = {}
+        for world in replay.worlds(experiment, there):
+            met |= world.found.ever_met
+            around = _around(replay, world.stretch)
+            for name, believed in receivers.believe(world):
+                if name not in judges:
+                    judges[name] = _Judge(replay, experiment, believed, receivers.issue_s(name), len(runs))
+                judges[name].add(around, believed)
+        for name, judge in judges.items():
+            appraisal, foreseen_s = judge.result()
+            if appraisal is not None:
                 appraisals[name] = appraisal
-            if measure.conflict is not None:
-                events[name] = replace(events[name], foreseen_s=_foreseen(replay, believed, appraisal, experiment))
+                if name not in events or measure.match.always:
+                    events[name] = Events(judge.units, appraisal.detections)
+            if foreseen_s is not None:
+                events[name] = replace(events[name], foreseen_s=foreseen_s)
     ordered = {name: events[name] for name in experiment.configurations}
     rows = table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, ordered)
-    return Outcome(replay.scene.log, runs, rows, appraisals)
+    return Outcome(replay.scene.log, runs, rows, appraisals, met)
+
+
+class _Judge:
+    """What comes of one configuration's lists, stretch by stretch."""
+
+    def __init__(self, replay: Replay, experiment: Experiment, first: Believed, issue_s: Float, runs: int) -> None:
+        measure = experiment.measure
+        self.units, self._runs = first.heard.units, runs
+        self._appraiser = self._foreseeing = None
+        if _needs_all(experiment):
+            self._appraiser = Appraiser(replay.surroundings, replay.looks, first, issue_s, measure)
+        if measure.conflict is not None:
+            self._foreseeing = Foreseeing(
+                replay.ego,
+                replay.looks,
+                measure.conflict,
+                confirm=measure.confirm,
+                count_earlier=measure.count_earlier,
+            )
+
+    def add(self, around: Surroundings, believed: Believed) -> None:
+        matches = None if self._appraiser is None else self._appraiser.add(around, believed)
+        if self._foreseeing is None:
+            return
+        if believed.belief is not None:
+            self._foreseeing.add(believed.belief)
+        else:  # lists without truth ids: run by run, by what they were matched with
+            assert matches is not None
+            for s in range(len(believed.lists.start)):
+                belief = as_belief(believed.lists, s, matches, believed.heard, believed.at.issue_s, believed.at.newest)
+                self._foreseeing.add(belief, s)
+        self._foreseeing.next(believed.at.issue_s)
+
+    def result(self) -> tuple[Appraisal | None, Float | None]:
+        appraisal = None if self._appraiser is None else self._appraiser.result(self._runs)
+        return appraisal, None if self._foreseeing is None else self._foreseeing.result(self._runs)
 
 
 def _by_truth_id(
-    replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None
+    replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None, met: Bool
 ) -> dict[str, Events]:
-    """Detections of the configurations that have truth ids: they need no states, only who was listed."""
-    world = replay.world(experiment, measured_only=True)
-    chosen = {name: c for name, c in world.experiment.configurations.items() if by_truth(c)}
+    """Detections of the configurations that have truth ids: they need no states, only who was listed.
+
+    Whose PEM's conditions are met is added to `met`.
+    """
+    units = fleet_of(experiment, replay.scene).experiment
+    chosen = {name: c for name, c in units.configurations.items() if by_truth(c)}
     if not chosen:
         return {}
-    seen = seen_by_all(world, runs, states="true", equipped=equipped)
+    seen = _sightings(replay, units, runs, equipped, met)
     events: dict[str, Events] = {}
     for name, configuration in chosen.items():
-        heard = listen(seen, replay.truth, world.experiment, configuration, there)
+        heard = listen(seen, replay.truth, units, configuration, there)
         result = detect(
             heard,
             replay.looks,
@@ -192,48 +300,74 @@ def _by_truth_id(
     return events
 
 
-def _foreseen(replay: Replay, believed: Believed, appraisal: Appraisal | None, experiment: Experiment) -> Float:
-    """(S, M) when each look is first seen to lead to a collision."""
-    measure = experiment.measure
-    assert measure.conflict is not None
-    beliefs = [believed.belief] if believed.belief is not None else _as_beliefs(believed, appraisal)
-    return np.concatenate(
-        [
-            foreseen(
-                belief,
-                replay.ego,
-                replay.looks,
-                measure.conflict,
-                confirm=measure.confirm,
-                count_earlier=measure.count_earlier,
-            )
-            for belief in beliefs
-        ]
+def _sightings(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, met: Bool) -> Tracks:
+    """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
+    pieces = []
+    for stretch in replay.stretches:
+        found = replay.found(stretch)
+        met |= found.ever_met
+        found = replay.measured if stretch == WHOLE else found.of_objects(replay.looks.object_ix)
+        recorded = None
+        if replay.recorded is not None:
+            recorded = replay.recorded.captured_between(stretch.from_s, stretch.until_s)
+        world = World(replay.scene, replay.truth, found, recorded, experiment, stretch)
+        seen = seen_by_all(world, runs, states="true", equipped=equipped)
+        if stretch == WHOLE:
+            return seen
+        looked_at = np.isin(seen.row_object_ix, replay.looks.object_ix)
+        pieces.append(seen.take_rows(np.flatnonzero(seen.valid.any(axis=0) & looked_at)))
+    return spliced(pieces, states=False)[0]
+
+
+def _around(replay: Replay, stretch: Stretch) -> Surroundings:
+    """What configurations share: of a whole log for good, of a stretch for the time being."""
+    return (
+        replay.surroundings if stretch == WHOLE else Surroundings(replay.scene, replay.truth, replay.fleet.experiment)
     )
 
 
-def _as_beliefs(believed: Believed, appraisal: Appraisal | None) -> list[Belief]:
-    """Lists without truth ids as tracks, run by run, by what they were matched with."""
-    assert appraisal is not None  # they are always matched
-    return [
-        as_belief(believed.lists, s, appraisal.matches, believed.heard, believed.at.issue_s, believed.at.newest)
-        for s in range(len(believed.lists.start))
-    ]
+@dataclass(frozen=True)
+class Beliefs:
+    """What the receiver believes in one run, configuration by configuration: its fused lists, stretch after stretch.
+
+    As often as one likes; of a log that is one stretch they are kept, of a longer one made anew each time.
+    """
+
+    replay: Replay
+    experiment: Experiment
+    run: int
+
+    def __iter__(self) -> Iterator[dict[str, Belief]]:
+        if len(self.replay.stretches) == 1:
+            yield self._whole
+        else:
+            yield from self._made()
+
+    @cached_property
+    def _whole(self) -> dict[str, Belief]:
+        return next(self._made())
+
+    def _made(self) -> Iterator[dict[str, Belief]]:
+        replay, runs = self.replay, np.array([self.run])
+        equipped = replay.fleet.equipped(replay.scene.log, runs)
+        there = None if equipped is None else equipped[0]
+        receivers = Receivers(runs, there)
+        for world in replay.worlds(self.experiment, there):
+            around = _around(replay, world.stretch)
+            result = {}
+            for name, one in receivers.believe(world):
+                if one.belief is not None:
+                    result[name] = one.belief
+                else:
+                    matches = match_lists(around, one, self.experiment.measure)
+                    result[name] = as_belief(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
+            yield result
 
 
 def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
-    """What the receiver believes in one run, configuration by configuration: its fused lists of all objects."""
-    runs = np.array([run])
-    equipped = replay.fleet.equipped(replay.scene.log, runs)
-    there = None if equipped is None else equipped[0]
-    result = {}
-    for name, one in believe(replay.world(experiment), runs, there):
-        if one.belief is not None:
-            result[name] = one.belief
-        else:
-            matches = match_lists(replay.surroundings, one, experiment.measure)
-            result[name] = as_belief(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
-    return result
+    """What the receiver believes in one run of a log that is one stretch."""
+    (whole,) = Beliefs(replay, experiment, run)
+    return whole
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
@@ -241,11 +375,11 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
 
     Units that only some runs have are taken to be there.
     """
-    world = replay.world(experiment, measured_only=True)
+    world = replay.lists_only(experiment)
     seen = seen_by_all(world, np.arange(1), states="true")
     rates = {}
     for name, configuration in world.experiment.configurations.items():
-        heard = listen(seen, replay.truth, world.experiment, configuration)
+        heard = listen(seen, world.truth, world.experiment, configuration)
         issue_s = instants(heard, max_age_s=configuration.max_age_s).issue_s
         rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
     return rates

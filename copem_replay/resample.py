@@ -14,9 +14,16 @@ import numpy as np
 
 from copem_replay.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int, Tracks
 
+_AT_ONCE = 1 << 20
+"""States interpolated at a time, for memory's sake (chosen)."""
+AROUND_S = 1e-3
+"""More than all tolerances of time together."""
+
 
 def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) -> Tracks:
     """The world at other instants: one list per instant of `stamps_ns (F,)` (ascending), of all objects then there."""
+    if _as_it_is(truth, stamps_ns):
+        return truth
     first, last = _ends(truth)
     lo = np.searchsorted(stamps_ns, first - SAME_INSTANT_NS, side="left")
     hi = np.searchsorted(stamps_ns, last + SAME_INSTANT_NS, side="right")
@@ -44,6 +51,15 @@ def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) 
     )
 
 
+def _as_it_is(truth: Tracks, stamps_ns: Int) -> bool:
+    """Whether these are the truth's own frames, and no object misses one of its stay: nothing is in between."""
+    if not np.array_equal(stamps_ns, truth.stamp_ns) or (np.diff(stamps_ns) <= 2 * SAME_INSTANT_NS).any():
+        return False
+    missed = np.diff(truth.frame_ix) != 1
+    missed[truth.start[1:-1] - 1] = False
+    return not missed.any()
+
+
 def states_at(
     truth: Tracks, object_ix: Int, time_s: Float, *, t0_ns: int, max_gap_s: float
 ) -> tuple[dict[str, Float], Bool]:
@@ -63,13 +79,29 @@ def _ends(truth: Tracks) -> tuple[Int, Int]:
 
 def _interpolate(truth: Tracks, track: Int, stamp_ns: Int, max_gap_s: float) -> tuple[dict[str, Float], Bool]:
     """Columns (K,) of the state of tracks (K,) at stamps (K,), and presence (K,). NaN where absent."""
+    columns = {name: np.full(len(track), np.nan) for name in VALUES}
+    present: Bool = np.zeros(len(track), dtype=bool)
     if len(track) == 0 or len(truth.frame_ix) == 0:
-        return {name: np.full(len(track), np.nan) for name in VALUES}, np.zeros(len(track), dtype=bool)
+        return columns, present
     own_ns = truth.stamp_ns[truth.frame_ix]
     # One sorted axis for all tracks: each gets its own stretch, long enough for the whole log.
     origin, stretch = own_ns.min(), int(np.ptp(own_ns)) + 10 * SAME_INSTANT_NS
     axis = own_ns - origin + truth.track_ix * stretch
-    first, last = _ends(truth)
+    ends = _ends(truth)
+    for begin in range(0, len(track), _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        states, present[part] = _between(truth, own_ns, axis, ends, track[part], stamp_ns[part], max_gap_s)
+        for name, values in states.items():
+            columns[name][part] = values
+    return columns, present
+
+
+def _between(
+    truth: Tracks, own_ns: Int, axis: Int, ends: tuple[Int, Int], track: Int, stamp_ns: Int, max_gap_s: float
+) -> tuple[dict[str, Float], Bool]:
+    """The same of some of them. `own_ns (P,)`: stamps of rows, `axis (P,)`: ascending over all tracks."""
+    origin, stretch = own_ns.min(), int(np.ptp(own_ns)) + 10 * SAME_INSTANT_NS
+    first, last = ends
     present = (track >= 0) & (stamp_ns >= first[track] - SAME_INSTANT_NS) & (stamp_ns <= last[track] + SAME_INSTANT_NS)
     stamp_ns = np.clip(stamp_ns, first[track], last[track])
     wanted = stamp_ns - origin + track * stretch + SAME_INSTANT_NS

@@ -27,7 +27,7 @@ from copem_replay.experiment import Experiment
 from copem_replay.fleet import of_run
 from copem_replay.plain_yaml import dump
 from copem_replay.read import Recording
-from copem_replay.replay import believed, prepare
+from copem_replay.replay import Beliefs, prepare
 from copem_replay.run import Result, log_path_of, shown_logs, shown_run
 
 _LIBRARIES = (
@@ -136,7 +136,7 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     alone = of_run(chosen, replay.scene, number)
     if alone is not chosen:  # with the units that this run has
         replay = prepare(recording, alone, onsets_of=experiment)
-    beliefs = believed(replay, alone, number)
+    beliefs = Beliefs(replay, alone, number)
     of_run_shown = (result.table["log"] == log) & (result.table["run"] == number)
     rows = result.table[of_run_shown & result.table["configuration"].isin(list(chosen.configurations))]
     summary = result.summary[result.summary["configuration"].isin(list(chosen.configurations))]
@@ -153,7 +153,7 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
         Path(f"{target}.rrd"),
         replay,
         alone,
-        beliefs,
+        next(iter(beliefs)),
         rows,
         summary,
         number,

@@ -176,21 +176,32 @@ class Tracks:
 
     def take_tracks(self, keep: Bool) -> Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
-        if keep.all():
-            return self
-        rows = keep[self.track_ix]
+        return self if keep.all() else self.take_rows(np.flatnonzero(keep[self.track_ix]))
+
+    def take_rows(self, rows: Int) -> Tracks:
+        """Only some rows, ascending (K,). Lists stay, tracks without rows do not."""
+        lengths = np.bincount(self.track_ix[rows], minlength=len(self.unit_ix))
+        held = lengths > 0
         columns: dict[str, Any] = {
             name: None if (a := getattr(self, name)) is None else a[:, rows]
             for name in ("valid", *VALUES, *UNCERTAINTIES)
         }
         return replace(
             self,
-            start=np.concatenate([[0], np.cumsum(np.diff(self.start)[keep])]),
-            unit_ix=self.unit_ix[keep],
-            object_ix=self.object_ix[keep],
+            start=np.concatenate([[0], np.cumsum(lengths[held])]),
+            unit_ix=self.unit_ix[held],
+            object_ix=self.object_ix[held],
             frame_ix=self.frame_ix[rows],
             **columns,
         )
+
+    def captured_between(self, from_s: float, until_s: float) -> Tracks:
+        """Only rows captured from an instant on and before another; of one unit, whose lists ascend in time."""
+        first, after = np.searchsorted(self.captured_s, (from_s, until_s))
+        if first == 0 and after == len(self.captured_s):
+            return self
+        order, bounds = self.by_frame
+        return self.take_rows(np.sort(order[bounds[first] : bounds[after]]))
 
 
 def joined(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
@@ -233,6 +244,36 @@ def joined(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
         valid=rows("valid").astype(bool),
         **{name: rows(name) for name in (*VALUES, *UNCERTAINTIES)},
     )
+
+
+def spliced(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Tracks, Int]:
+    """Rows of the same lists as one, and where each comes from: its place (P,) in the pieces one after the other.
+
+    `states=False`: nobody will ask for them, they are 0.
+    """
+    unit_ix, object_ix, frame_ix = (
+        np.concatenate([getattr(piece, name) for piece in pieces])
+        for name in ("row_unit_ix", "row_object_ix", "frame_ix")
+    )
+    order = np.lexsort((frame_ix, object_ix, unit_ix))
+    unit_ix, object_ix = unit_ix[order], object_ix[order]
+    new = np.flatnonzero((np.diff(unit_ix, prepend=-1) != 0) | (np.diff(object_ix, prepend=-1) != 0))
+
+    def rows(name: str) -> Any:
+        if not states and name != "valid":
+            return None if name in UNCERTAINTIES else np.broadcast_to(0.0, (1, len(order)))
+        columns = [getattr(piece, name) for piece in pieces]
+        return None if columns[0] is None else np.concatenate(columns, axis=1)[:, order]
+
+    tracks = replace(
+        pieces[0],
+        start=np.append(new, len(order)),
+        unit_ix=unit_ix[new],
+        object_ix=object_ix[new],
+        frame_ix=frame_ix[order],
+        **{name: rows(name) for name in ("valid", *VALUES, *UNCERTAINTIES)},
+    )
+    return tracks, order
 
 
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.experiment import Obstacle, Unit
-from copem_replay.resample import wrap
+from copem_replay.experiment import Experiment, Obstacle, Unit
+from copem_replay.resample import at_instants, wrap
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
 from copem_replay.visibility import NO_STATICS, Observers, Statics, statics
 
@@ -27,6 +27,33 @@ class Poses:
     present: Bool
 
 
+@dataclass(frozen=True)
+class Placed:
+    """All modelled units at each of their lists, in the experiment's order, and the static obstacles around them."""
+
+    stamps_ns: dict[str, Int]  # (F,) captures
+    poses: dict[str, Poses]
+    carrier_ix: dict[str, int]  # −1: a fixed place
+    static: Statics
+    notes: tuple[str, ...]
+
+
+def place(scene: Scene, truth: Tracks, experiment: Experiment) -> Placed:
+    """Where the units of an experiment are over one log (`truth`: the world at its own frames)."""
+    notes: list[str] = []
+    static = place_obstacles(truth, experiment.obstacles, notes)
+    stamps: dict[str, Int] = {}
+    there: dict[str, Poses] = {}
+    carriers = {name: carrier(scene, unit) for name, unit in experiment.modelled.items()}
+    for name, unit in experiment.modelled.items():
+        stamps[name] = list_instants(scene, truth, unit)
+        host = truth.take_tracks(truth.object_ix == carriers[name])
+        if unit.rate_hz is not None:
+            host = at_instants(host, stamps[name], t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
+        there[name] = poses(scene, unit, host, unit_ground(truth, name, unit, notes))
+    return Placed(stamps, there, carriers, static, tuple(notes))
+
+
 def list_instants(scene: Scene, truth: Tracks, unit: Unit) -> Int:
     """(F,) capture stamps of a unit's lists: the frames of the truth, or t0 + phase + k / rate within the log."""
     if unit.rate_hz is None:
@@ -40,7 +67,7 @@ def list_instants(scene: Scene, truth: Tracks, unit: Unit) -> Int:
 
 
 def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
-    """Where a unit is at each list of `world`, which holds the world at the unit's list instants."""
+    """Where a unit is at each list of `world`, which holds its carrier at the unit's list instants."""
     n = len(world.stamp_ns)
     if unit.at is not None:
         heading = np.full(n, wrap(np.deg2rad(np.array(unit.yaw_deg))))

@@ -9,9 +9,10 @@ appears under its name when it is complete, or not at all.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from copem_replay.families import OSI_CHANNEL, Family, ListWriter, Osi, osi_vers
 from copem_replay.formats import detail
 from copem_replay.fusion.belief import Belief
 from copem_replay.passthrough import Catalogue, Original
-from copem_replay.tracks import Scene, Tracks
+from copem_replay.tracks import SAME_INSTANT_NS, Scene, Tracks
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
@@ -39,12 +40,12 @@ def write_mcap(
     path: Path,
     source: Path,
     scene: Scene,
-    beliefs: Mapping[str, Belief],
+    beliefs: Iterable[Mapping[str, Belief]],
     table: pd.DataFrame,
     manifest: Mapping[str, str],
     family: Family | None = None,
 ) -> list[str]:
-    """`source` with the fused lists of one run added: `beliefs[configuration]` has values (1, P).
+    """`source` with the fused lists of one run added, stretch by stretch: `belief[configuration]` has values (1, P).
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
@@ -55,17 +56,34 @@ def write_mcap(
     """
     original = Original(source)
     family = family or Osi()
-    colours = configuration_colours(beliefs)
-    units = dict.fromkeys(unit for belief in beliefs.values() for unit in belief.heard.units)
+    rest = iter(beliefs)
+    first = next(rest)  # it tells the configurations and the units
+    colours = configuration_colours(first)
+    units = dict.fromkeys(unit for belief in first.values() for unit in belief.heard.units)
     numbers = {unit: k + 1 for k, unit in enumerate(units)}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)
-        ours = {topic for name in beliefs for topic in topics_of(name)}
-        streams = [original.messages(original.register(catalogue, without=ours))]
+        ours = {topic for name in first for topic in topics_of(name)}
+        messages = original.messages(original.register(catalogue, without=ours))
         opened = family.open(catalogue, scene, numbers)
-        for name, belief in beliefs.items():
-            events = _events(belief.fused, table[table["configuration"] == name])
-            streams.append(_lists(scene, belief.fused, opened.channels(name, belief, events, colours[name])))
+
+        def lists_of(stretch: Mapping[str, Belief]) -> list[Iterator[Message]]:
+            return [
+                _lists(
+                    scene,
+                    belief.fused,
+                    opened.channels(
+                        name, belief, _events(belief.fused, table[table["configuration"] == name]), colours[name]
+                    ),
+                )
+                for name, belief in stretch.items()
+            ]
+
+        begun = lists_of(first)  # registers the channels
+        del first
+        added = chain.from_iterable(
+            _in_order(streams) for streams in chain([begun], (lists_of(stretch) for stretch in rest))
+        )
         units_record = {f"unit.{number}": unit for unit, number in numbers.items()}
         for name, record in _kept(original).items():
             if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
@@ -73,13 +91,17 @@ def write_mcap(
         writer.add_metadata(RUN_RECORD, dict(sorted({**manifest, **units_record}.items())))
         if family.osi:
             writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
-        for message in heapq.merge(*streams, key=lambda m: m.log_time):
+        for message in _in_order([messages, added]):
             writer.add_message(
                 message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
             )
     replaced = sorted(ours & {channel.topic for channel in original.channels.values()})
     notes = [f"{len(replaced)} topics of an earlier replay are replaced ({replaced[0]} …)"] if replaced else []
     return [*([original.damage] if original.damage else []), *notes]
+
+
+def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
+    return heapq.merge(*streams, key=lambda m: m.log_time)
 
 
 def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
@@ -92,8 +114,12 @@ def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> It
 def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]:
     """What was detected with each list: detections by the index of the list that was then available."""
     events: dict[int, list[detail.Event]] = {}
+    issue_s = fused.arrives_s[0]
     for row in table[table["detected"]].to_dict("records"):
-        frame = int(np.abs(fused.arrives_s[0] - row["detection_s"]).argmin())
+        away_s = np.abs(issue_s - row["detection_s"])
+        frame = int(away_s.argmin()) if len(away_s) else -1
+        if frame < 0 or away_s[frame] > 2e-9 * SAME_INSTANT_NS:  # in another stretch
+            continue
         event = {"object": row["object_id"], "first_unit": row["first_unit"]}
         for name in ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m"):
             event[name] = None if row[name] != row[name] else float(row[name])

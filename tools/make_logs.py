@@ -1,6 +1,7 @@
 """Make the sample recordings in `logs/`: the same bytes on every call.
 
     python tools/make_logs.py [tc016d …] [--out logs]
+    python tools/make_logs.py --long --out FOLDER [--minutes 60] [--objects 100]
 
 A recording is an OSI multi-channel trace (MCAP). A further one is a function that returns a `Recording`, in a
 module beside this one, say, and an entry in `recipes`. Axes in metres: x along the road, y to its left, z up.
@@ -193,6 +194,17 @@ def recipes() -> dict[str, Callable[[], Recording]]:
     return {"tc016d": tc016d, "crossing": crossing}
 
 
+def long_drive(minutes: float, objects: int = 100) -> Recording:
+    """Return a drive of many minutes through a city: for what long recordings cost."""
+    from city import city
+
+    return Recording(
+        description=f"A drive of {minutes:g} minutes among {objects} objects at a time: a load, no traffic.",
+        topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users"},
+        messages=city(minutes, objects),
+    )
+
+
 # Writing ----------------------------------------------------------------------------------------------------
 
 
@@ -245,7 +257,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Make the sample recordings.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(recipes())}; none: all")
     parser.add_argument("--out", type=Path, default=logs, help="folder (default: the project's logs/)")
+    parser.add_argument("--long", action="store_true", help="only the long drive, city.mcap; it is not committed")
+    parser.add_argument("--minutes", type=float, default=60.0, help="how long the long drive is (default: 60)")
+    parser.add_argument("--objects", type=int, default=100, help="how many there are at a time (default: 100)")
     arguments = parser.parse_args()
+    if arguments.long:
+        write_recording(long_drive(arguments.minutes, arguments.objects), arguments.out / "city.mcap")
+        return
     if unknown := set(arguments.names) - set(recipes()):
         parser.error(f"no recipe for {', '.join(sorted(unknown))}; there are: {', '.join(recipes())}")
     for name in arguments.names or recipes():

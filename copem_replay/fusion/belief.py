@@ -61,13 +61,21 @@ class Belief:
         _first_unit(self.heard.valid, arrives_s, self.heard.row_unit_ix, self.entries, self.start, first)
         return first
 
+    @cached_property
+    def _place(self) -> Int:
+        """(P,) places of rows in their lists."""
+        order, bounds = self.fused.by_frame
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order)) - np.repeat(bounds[:-1], np.diff(bounds))
+        return place
+
     def name_of(self, scene: Scene, row: int) -> str:
-        """The id of the object a row is about, else the fusion's own identity for it, else its number."""
+        """The id of the object a row is about, else the fusion's own identity for it, else its place in its list."""
         object_ix = int(self.fused.row_object_ix[row])
         if object_ix >= 0:
             return scene.object_ids[object_ix]
         track_id = -1 if self.said is None else int(self.said["track_id"][row])
-        return f"track:{track_id}" if track_id >= 0 else f"entry:{row}"
+        return f"track:{track_id}" if track_id >= 0 else f"entry:{self._place[row]}"
 
     def class_of(self, scene: Scene) -> Int:
         """(P,) index into CLASSES: the true one, or what the fusion takes it for."""

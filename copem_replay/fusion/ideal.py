@@ -15,21 +15,21 @@ import numpy as np
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.fusion.belief import Belief
 from copem_replay.fusion.combine import FLATTEST
-from copem_replay.fusion.instants import instants
+from copem_replay.fusion.instants import Instants, instants
 from copem_replay.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
 
 SMALLEST_VARIANCE = 1e-9
 """A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
 
 
-def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1) -> Belief:
-    """One fused list per instant of the receiver, as tracks of the one unit `fused`.
+def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1, at: Instants | None = None) -> Belief:
+    """One fused list per instant of the receiver, as tracks of the one unit `fused`. `at`: some of the instants.
 
     `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
     `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
     """
-    at = instants(heard, max_age_s=max_age_s)
+    at = at or instants(heard, max_age_s=max_age_s)
     rows, start, object_ix, instant = _contributions(heard, at.newest, without_object_ix)
     valid = _any(heard.valid, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}

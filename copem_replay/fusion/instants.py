@@ -29,6 +29,17 @@ class Instants:
     arrived: Int
     arrived_start: Int
 
+    def between(self, from_s: float, until_s: float) -> Instants:
+        """Those from one time on and before another."""
+        first, after = np.searchsorted(self.issue_s, (from_s, until_s))
+        begin, end = self.arrived_start[first], self.arrived_start[after]
+        return Instants(
+            self.issue_s[first:after],
+            self.newest[first:after],
+            self.arrived[begin:end],
+            self.arrived_start[first : after + 1] - begin,
+        )
+
 
 def instants(heard: Tracks, *, max_age_s: float) -> Instants:
     """The receiver's instants for lists whose arrival times are common to all runs."""

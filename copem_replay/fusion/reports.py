@@ -12,7 +12,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.fusion.ideal import floored
-from copem_replay.fusion.instants import instants
+from copem_replay.fusion.instants import Instants, instants
 from copem_replay.fusion.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
 from copem_replay.tracks import VALUES, Bool, Float, Int, Tracks
 
@@ -52,9 +52,12 @@ def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[
     return Lists(start, entries), run, picked
 
 
-def reports(heard: Tracks, lists: Lists, *, max_age_s: float) -> Reports:
-    """The same lists as one configuration's receiver has them: when each arrives, and which it goes by when."""
-    at = instants(heard, max_age_s=max_age_s)
+def reports(heard: Tracks, lists: Lists, *, max_age_s: float, at: Instants | None = None) -> Reports:
+    """The same lists as one configuration's receiver has them: when each arrives, and which it goes by when.
+
+    `at`: some of the instants.
+    """
+    at = at or instants(heard, max_age_s=max_age_s)
     return Reports(
         heard.units, heard.frame_unit_ix, heard.captured_s, heard.arrives_s[0], lists,
         at.issue_s, at.newest, at.arrived, at.arrived_start,

@@ -76,7 +76,7 @@ def _fill(
     _properties(out, replay, experiment, list(beliefs), run)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, world.class_colours())
     world.truth(out, scene, replay.truth, shown)
-    world.statics(out, replay.found.static)
+    world.statics(out, replay.placed.static)
     units.units(out, replay, experiment)
     sight.sight(out, replay, experiment, shown)
     marks.onsets(out, replay, experiment, table, shown)

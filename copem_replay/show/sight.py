@@ -35,8 +35,8 @@ def sight(out: Out, replay: Replay, experiment: Experiment, shown: Sequence[int]
     unit = experiment.modelled[first]
     at = poses(scene, unit, truth, unit_ground(truth, first, unit, []))
     observer, flat = observers([at], np.array([carriers[first]])), experiment.visibility == "flat"
-    [share] = visible_shares(truth, replay.found.static, observer, flat=flat)
-    [blocker] = hidden_by(truth, replay.found.static, observer, flat=flat)
+    [share] = visible_shares(truth, replay.placed.static, observer, flat=flat)
+    [blocker] = hidden_by(truth, replay.placed.static, observer, flat=flat)
     there = np.isin(truth.row_object_ix, shown) & ~np.isnan(share)  # NaN: the unit is absent, or carried by it
     # What is hidden is hidden by something: −1 comes with a share of 1.
     clear, hidden = there & (share > CLEAR_ABOVE), there & (share <= CLEAR_ABOVE)
@@ -65,7 +65,7 @@ def _obstacle_centres(replay: Replay, experiment: Experiment) -> np.ndarray:
     """(K, 3) of the experiment's own obstacles, halfway up."""
     import shapely
 
-    static = replay.found.static
+    static = replay.placed.static
     if not experiment.obstacles:
         return np.empty((0, 3), dtype=np.float32)
     middle = shapely.centroid([shapely.Polygon(o.polygon_m) for o in experiment.obstacles])

@@ -26,7 +26,7 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
 
     many = len(experiment.modelled) > MANY_UNITS
     for name, unit in experiment.modelled.items():
-        at, path = replay.found.poses[name], ["world", "units", name]
+        at, path = replay.placed.poses[name], ["world", "units", name]
         place, there = f32(at.x_m, at.y_m, at.z_m), at.present
         elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
         if unit.at is not None:

@@ -1,0 +1,93 @@
+"""Stretches: a long log is replayed piece by piece, so that memory does not grow with its length.
+
+What is cut are the receiver's instants: a stretch has those from `from_s` on and before `until_s`. Its lists, what is
+fused of them, matched and measured are made, used and forgotten before the next one; what must be remembered across a
+cut is. Where the cuts are changes no result, and a log that is not long is one stretch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from copem_replay.experiment import Configuration, Experiment
+from copem_replay.fusion.component import ListFusion
+from copem_replay.resample import AROUND_S
+from copem_replay.tracks import Float, Scene, Tracks
+from copem_replay.units import list_instants
+
+ROWS_AT_ONCE = 4_000_000
+"""A log with at most so many candidate rows is one stretch (chosen: about 2 GB at most)."""
+ROWS_A_STRETCH = 500_000
+"""Candidate rows of a stretch of a longer one (chosen: a few hundred MB)."""
+_AFTER = 0.381966
+"""Where between two frames a cut is (chosen: hardly any latency brings a list there)."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Instants from `from_s` on and before `until_s`, in seconds of the log."""
+
+    from_s: float = -np.inf
+    until_s: float = np.inf
+
+
+WHOLE = Stretch()
+
+
+def stretches(scene: Scene, truth: Tracks, experiment: Experiment) -> tuple[Stretch, ...]:
+    """A log in stretches of about as many candidate rows each; `experiment`: with a unit per carrier."""
+    if not _can_be_cut(experiment.configurations.values()):
+        return (WHOLE,)
+    lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
+    # The truth is perceived, too.
+    rows = len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
+    if rows <= ROWS_AT_ONCE:
+        return (WHOLE,)
+    _, bounds = truth.by_frame
+    pieces = int(-(-rows // ROWS_A_STRETCH))
+    frames = np.unique(np.searchsorted(bounds, np.linspace(0, len(truth.frame_ix), pieces + 1)[1:-1]))
+    frames = frames[(frames > 0) & (frames < len(truth.stamp_ns))]
+    before_s, after_s = truth.captured_s[frames - 1], truth.captured_s[frames]
+    # Where lists of different configurations are available within a nanosecond no cut may come between them.
+    cuts = [-np.inf, *(before_s + _AFTER * (after_s - before_s)).tolist(), np.inf]
+    return tuple(Stretch(*pair) for pair in pairwise(cuts))
+
+
+def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
+    return all(fusion.resumable for c in configurations if isinstance(fusion := c.fusion, ListFusion))
+
+
+class Reach:
+    """How long ago a list may have been captured that is gone by at an instant of a stretch, or needed once more.
+
+    `heard`: by configuration the lists that its receiver hears, whatever is in them.
+    """
+
+    def __init__(self, experiment: Experiment, heard: Mapping[str, Tracks]) -> None:
+        self._age_s = 0.0
+        self._again: list[tuple[Float, Float]] = []
+        for name, configuration in experiment.configurations.items():
+            arrives_s, captured_s = heard[name].arrives_s[0], heard[name].captured_s
+            came = np.flatnonzero(np.isfinite(arrives_s))
+            if not len(came):
+                continue
+            on_its_way_s = float((arrives_s[came] - captured_s[came]).max())
+            self._age_s = max(self._age_s, on_its_way_s + configuration.max_age_s + AROUND_S)
+            fusion = configuration.fusion
+            if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
+                came = came[np.argsort(arrives_s[came], kind="stable")]
+                newest_s = np.maximum.accumulate(captured_s[came])
+                self._again.append((arrives_s[came], newest_s - fusion.looks_back_s - AROUND_S))
+
+    def earliest_s(self, from_s: float) -> float:
+        """The earliest capture that a stretch from an instant on needs."""
+        earliest_s = from_s - self._age_s
+        for arrives_s, needed_s in self._again:
+            arrived = int(np.searchsorted(arrives_s, from_s))
+            if arrived:
+                earliest_s = min(earliest_s, float(needed_s[arrived - 1]))
+        return earliest_s
