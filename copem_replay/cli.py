@@ -209,7 +209,11 @@ def view(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results fol
     import subprocess
 
     place = folder.absolute()  # no name that looks like an option
-    files = [p for p in [place / "replay.rrd", *sorted(place.glob("replay/**/*.rrd"))] if p.is_file()]
+    found = (
+        sorted(place.glob(pattern))
+        for pattern in ("replay.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
+    )
+    files = [path for paths in found for path in paths if path.is_file()]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     if not files:
