@@ -142,7 +142,7 @@ def _ways(
         for at in ("detection_s_baseline", "detection_s")
     ]
     there = ends[0][1] & ends[1][1]
-    lines = np.stack([f32(at["x_m"], at["y_m"], at["z_m"] + at["height_m"] / 2) for at, _ in ends], axis=1)[there]
+    lines = np.stack([f32(at["x_m"], at["y_m"], at["z_m"]) for at, _ in ends], axis=1)[there]
     ways = ways[there]
     after_s = ways["detection_s"] - ways["detection_s_baseline"]
     labels = [f"{one} {s:+.2f} s to {baseline}" for one, s in zip(ways["object_id"], after_s, strict=True)]
