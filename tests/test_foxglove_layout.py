@@ -16,6 +16,7 @@ from copem_replay.errors import InputError
 from copem_replay.experiment_file import load, log_paths
 from copem_replay.results import write_results
 from copem_replay.run import run
+from test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -110,3 +111,17 @@ def test_what_has_no_scene_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("no recording")
     with pytest.raises(InputError, match=r"text.mcap: cannot be read"):
         layout_of(tmp_path / "text.mcap")
+
+
+def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
+    """Scenes in CDR, in the frame of reference of the recording."""
+    drive(tmp_path / "drive.mcap", "square")
+    (tmp_path / "e.yaml").write_text(EXPERIMENT)
+    source = load(tmp_path / "e.yaml")
+    experiment, wrong = problems(source)
+    assert experiment is not None, wrong
+    recordings, _ = read_logs(experiment, log_paths(source)[0], source)
+    write_results(tmp_path / "out", experiment, recordings, run(experiment, recordings))
+    panels = layout_of(tmp_path / "out/replay.mcap")["configById"].values()
+    assert [panel["foxglovePanelTitle"] for panel in panels] == ["GT", "PEM", "coPEM", "gnn"]
+    assert {panel["followTf"] for panel in panels} == {"square"}

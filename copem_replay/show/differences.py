@@ -28,9 +28,8 @@ from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 GAINED: Rgb = (0, 158, 115)
 LOST: Rgb = (213, 94, 0)
 """Bluish green and vermillion, told apart by colour-blind readers (Okabe & Ito 2008)."""
-_ABOVE_M = 1.2
-_MARK = 7
-"""Points above a box, clear of what else is drawn there (chosen)."""
+_ABOVE_M, _MARK_POINTS = 3.0, 7
+"""How far marks are above a box, clear of its name, and how large they are (chosen)."""
 
 
 def differences(
@@ -76,7 +75,9 @@ def _who_knows(
         columns = rr.Points3D.columns(positions=place, labels=labels).partition(counts[kept])
         path = ["world", part_of(name), "difference", part]
         out.columns(path, instants[kept], columns)
-        out.static(path, rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(_MARK), show_labels=True))
+        out.static(
+            path, rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(_MARK_POINTS), show_labels=True)
+        )
 
 
 def _held(tracks: Tracks, instants: Int, objects: int) -> Bool:
