@@ -1,8 +1,8 @@
-# make demo | test | bench | check | notebooks: each sets up .venv on its first call and never again while pyproject and constraints stay.
+# make demo | test | bench | check | notebooks | pictures: each sets up .venv on its first call and never again while pyproject and constraints stay.
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test bench check notebooks clean
+.PHONY: demo test bench check notebooks pictures clean
 
 .venv/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
@@ -32,6 +32,9 @@ check: .venv/.installed
 
 notebooks: .venv/.installed
 	$(BIN)/python tools/run_notebooks.py
+
+pictures: .venv/.installed
+	$(BIN)/python tools/pictures.py
 
 clean:
 	rm -rf .venv out build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

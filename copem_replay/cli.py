@@ -163,6 +163,13 @@ def compare(
     ghosts_per_min: Annotated[
         float | None, typer.Option(metavar="X", min=0, help="Ghosts at which times are compared [the baseline's].")
     ] = None,
+    rrd: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write one run in all of them as a Rerun recording (.rrd).")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option(metavar="N", help="Run in that recording [as in the baseline's replay.rrd].")
+    ] = None,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log in that recording [likewise].")] = None,
 ) -> int:
     """Configurations with a baseline, paired on log, object and run, within or across results folders."""
     from copem_replay.compare import check_out, comparison_text, write_comparison
@@ -170,13 +177,24 @@ def compare(
 
     if out is not None:
         check_out(out)
+    if rrd is not None:
+        from copem_replay.compare.beside import check_beside, write_beside
+
+        check_beside(rrd)
+    elif run is not None or log is not None:
+        raise InputError(f"--{'log' if run is None else 'run'}: expected --rrd FILE with it, found none")
     names = None if configurations is None else [name.strip() for name in configurations.split(",")]
     comparison = compared(folders, configurations=names, baseline=baseline, ghosts_per_min=ghosts_per_min)
-    _complain(f"note: {note}" for note in comparison.notes)
+    notes = list(comparison.notes)
+    if rrd is not None:
+        notes += write_beside(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
+    _complain(f"note: {note}" for note in notes)
     _print_blocks([comparison_text(comparison).splitlines()])
     if out is not None:
         write_comparison(comparison, out)
-        print(_printable(f"written to {out}"))
+    for file in (out, rrd):
+        if file is not None:
+            print(_printable(f"written to {file}"))
     return 0
 
 
@@ -209,7 +227,11 @@ def view(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results fol
     import subprocess
 
     place = folder.absolute()  # no name that looks like an option
-    files = [p for p in [place / "replay.rrd", *sorted(place.glob("replay/**/*.rrd"))] if p.is_file()]
+    found = (
+        sorted(place.glob(pattern))
+        for pattern in ("replay.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
+    )
+    files = [path for paths in found for path in paths if path.is_file()]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     if not files:

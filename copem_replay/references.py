@@ -50,8 +50,11 @@ def references(source: Source) -> Iterator[str]:
         if _is_name(name) and str(name) not in configurations:
             yield source.at(("show", "configurations", k), unknown("configuration", name, configurations))
     run = show.get("run") if isinstance(show, dict) else None
-    if isinstance(run, int) and isinstance(runs, int) and 1 <= runs <= run:
-        yield source.at(("show", "run"), f"expected a run below {runs}, found {run}")
+    several = enumerate(run) if isinstance(run, list) else ()
+    places: list[tuple[Key, object]] = [(("show", "run", k), one) for k, one in several] or [(("show", "run"), run)]
+    for key, one in places:
+        if type(one) is int and isinstance(runs, int) and 1 <= runs <= one:
+            yield source.at(key, f"expected a run below {runs}, found {one}")
 
 
 def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:

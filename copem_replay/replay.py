@@ -339,12 +339,18 @@ class Beliefs:
 
     def __iter__(self) -> Iterator[dict[str, Belief]]:
         if len(self.replay.stretches) == 1:
-            yield self._whole
+            yield self._all
         else:
             yield from self._made()
 
+    def whole(self) -> dict[str, Belief]:
+        """All of it at once. Raises ExperimentError where that is too much."""
+        if len(self.replay.stretches) > 1:
+            raise ExperimentError(f"{self.replay.scene.log}: too long to be held at once; take a window of it")
+        return self._all
+
     @cached_property
-    def _whole(self) -> dict[str, Belief]:
+    def _all(self) -> dict[str, Belief]:
         return next(self._made())
 
     def _made(self) -> Iterator[dict[str, Belief]]:
@@ -365,9 +371,8 @@ class Beliefs:
 
 
 def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Belief]:
-    """What the receiver believes in one run of a log that is one stretch."""
-    (whole,) = Beliefs(replay, experiment, run)
-    return whole
+    """What the receiver believes in one run of a log that is not long."""
+    return Beliefs(replay, experiment, run).whole()
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:

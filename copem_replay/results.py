@@ -24,11 +24,10 @@ from copem_replay.accuracy_tables import AccuracyTables
 from copem_replay.check import place_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
-from copem_replay.fleet import of_run
 from copem_replay.plain_yaml import dump
 from copem_replay.read import Recording
-from copem_replay.replay import Beliefs, prepare
-from copem_replay.run import Result, log_path_of, shown_logs, shown_run
+from copem_replay.run import Result, log_path_of
+from copem_replay.shown import ShownRun, one_run, shown_logs, shown_runs
 
 _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
@@ -115,48 +114,47 @@ def _fill(
         write_csv(result.sweep, scratch / "sweep.csv")
     notes = list(result.notes)
     for log in shown_logs(experiment, result):
-        target = scratch / "replay" if len(recordings) == 1 else scratch / "replay" / log
-        said = _show(target, log, experiment, recordings, result)
-        notes += [f"{log}: {line}" for line in said]
+        for shown in shown_runs(experiment, result, log):
+            target = scratch / shown.stem if len(recordings) == 1 else scratch / shown.stem / log
+            said = _show(target, log, shown, experiment, recordings, result)
+            notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
     provenance = provenance_of(experiment, recordings, result, skipped, notes)
     (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return notes
 
 
-def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> list[str]:
+def _show(
+    target: Path, log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
+) -> list[str]:
     from copem_replay.families import family_of
     from copem_replay.show import write_rrd
     from copem_replay.write import write_mcap
 
     recording = next(r for r in recordings if r.scene.log == log)
-    number = shown_run(experiment, result, log)
-    assert number is not None  # shown_logs names none otherwise
-    replay = next(r for r in result.replays if r.scene.log == log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
-    alone = of_run(chosen, replay.scene, number)
-    if alone is not chosen:  # with the units that this run has
-        replay = prepare(recording, alone, onsets_of=experiment)
-    beliefs = Beliefs(replay, alone, number)
-    of_run_shown = (result.table["log"] == log) & (result.table["run"] == number)
+    one = one_run(recording, chosen, shown.run, next(r for r in result.replays if r.scene.log == log))
+    of_run_shown = (result.table["log"] == log) & (result.table["run"] == shown.run)
     rows = result.table[of_run_shown & result.table["configuration"].isin(list(chosen.configurations))]
     summary = result.summary[result.summary["configuration"].isin(list(chosen.configurations))]
     manifest = {
         "copem_replay": version("copem-replay"),
         "experiment": dump(experiment.as_written() | {"logs": [log_path_of(recordings, log).name]}),
         "log": log,
-        "run": str(number),
+        "run": str(shown.run),
+        "run_is": shown.why,
     }
     said = write_mcap(
-        Path(f"{target}.mcap"), recording.path, replay.scene, beliefs, rows, manifest, family_of(recording)
+        Path(f"{target}.mcap"), recording.path, one.replay.scene, one.beliefs, rows, manifest, family_of(recording)
     )
     write_rrd(
         Path(f"{target}.rrd"),
-        replay,
-        alone,
-        next(iter(beliefs)),
+        one.replay,
+        one.experiment,
+        next(iter(one.beliefs)),
         rows,
         summary,
-        number,
+        shown.run,
+        run_is=shown.why,
     )
     return said
 
@@ -169,6 +167,7 @@ def provenance_of(
     notes: Sequence[str],
 ) -> dict[str, object]:
     """What made these results: versions, logs, seed, metric parameters; no clock, no host."""
+    shown = {log: shown_runs(experiment, result, log) for log in shown_logs(experiment, result)}
     return {
         "copem_replay": version("copem-replay"),
         "python": platform.python_version(),
@@ -183,7 +182,11 @@ def provenance_of(
         "max_gap_s": experiment.max_gap_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
         "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
-        "run_shown": {log: shown_run(experiment, result, log) for log in shown_logs(experiment, result)},
+        "run_shown": {log: runs[0].run for log, runs in shown.items()},
+        "runs_shown": {
+            log: [{"file": each.stem, "run": each.run, "run_is": each.why or None} for each in runs]
+            for log, runs in shown.items()
+        },
         "notes": list(notes),
     }  # fmt: skip
 

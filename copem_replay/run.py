@@ -192,36 +192,6 @@ def _notes(replay: Replay, experiment: Experiment, met: NDArray[np.bool_]) -> li
     return notes
 
 
-def shown_run(experiment: Experiment, result: Result, log: str) -> int | None:
-    """Which run of a log is written to MCAP and .rrd.
-
-    `median` and `worst` rank the runs by the time to detection summed over configurations and measured objects, never
-    detected counting as the horizon; of equal runs the first.
-    """
-    if experiment.show is None or experiment.show.run is None:
-        return None
-    if isinstance(experiment.show.run, int):
-        return experiment.show.run
-    part = result.table[result.table["log"] == log]
-    if not len(part):
-        return 0
-    time_s = part["time_to_detection_s"].fillna(result.horizon_s)
-    total = time_s.groupby(part["run"]).sum()
-    ranked = total.index[np.argsort(total.to_numpy(), kind="stable")]
-    return int(ranked[-1] if experiment.show.run == "worst" else ranked[(len(ranked) - 1) // 2])
-
-
-def shown_logs(experiment: Experiment, result: Result) -> list[str]:
-    """Names of the logs that are written to MCAP and .rrd."""
-    names = [replay.scene.log for replay in result.replays]
-    if experiment.show is None or experiment.show.run is None:
-        return []
-    wanted = experiment.show.logs
-    if "all" in wanted:
-        return names
-    return [name for k, name in enumerate(names) if name in wanted or (k == 0 and "first" in wanted)]
-
-
 def log_path_of(recordings: Sequence[Recording], log: str) -> Path:
     """Where a log lies."""
     return next(recording.path for recording in recordings if recording.scene.log == log)

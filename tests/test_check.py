@@ -136,6 +136,8 @@ class TestReferences:
     def test_run_that_is_not_made(self, tmp_path: Path, run: int) -> None:
         found = without_logs(tmp_path, changed(f"show: {{run: {run}}}"))
         assert found == [f"18: show.run: expected a run below 4, found {run}"]
+        found = without_logs(tmp_path, changed(f"show: {{run: [median, 3, {run}]}}"))
+        assert found == [f"18: show.run[2]: expected a run below 4, found {run}"]
 
     def test_without_units(self, tmp_path: Path) -> None:
         text = "version: 1\nlogs: [drive.mcap]\nconfigurations: {all: {units: all}, one: {units: [ego]}}\n"

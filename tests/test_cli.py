@@ -948,11 +948,19 @@ class TestView:
         assert json.loads(viewer.read_text()) == [str(tmp_path / "-r/replay.rrd")]
 
     def test_opens_all_recordings(self, tmp_path: Path, call: Call, viewer: Path) -> None:
-        for name in ("b", "a/c"):
-            (tmp_path / "r/replay" / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / "r/replay" / f"{name}.rrd").touch()
+        names = ("replay/a/c", "replay/b", "replay_worst/a/c", "replay_worst/b")
+        for name in (*reversed(names), "figures/c"):
+            (tmp_path / "r" / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / "r" / f"{name}.rrd").touch()
         assert call("view", "r").code == 0
-        assert json.loads(viewer.read_text()) == [str(tmp_path / f"r/replay/{name}.rrd") for name in ("a/c", "b")]
+        assert json.loads(viewer.read_text()) == [str(tmp_path / f"r/{name}.rrd") for name in names]
+
+    def test_opens_all_runs(self, tmp_path: Path, call: Call, viewer: Path) -> None:
+        for name in ("replay_7", "replay", "replay_worst", "compared"):
+            (tmp_path / f"{name}.rrd").touch()
+        assert call("view", ".").code == 0
+        names = ("replay", "replay_7", "replay_worst")
+        assert json.loads(viewer.read_text()) == [str(tmp_path / f"{name}.rrd") for name in names]
 
     def test_viewer_that_fails(self, tmp_path: Path, call: Call, viewer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "replay.rrd").touch()
@@ -1026,7 +1034,9 @@ class TestSchema:
             "measure: {onset: {kind: soon}}",
             "measure: {onset: {kind: in_range, range_m: 0}}",
             "measure: {onset: {kind: starts_moving, from_: front}}",
-            "show: {run: best}",
+            "show: {run: mean}",
+            "show: {run: [best, mean]}",
+            "show: {run: []}",
         ],
     )
     def test_refuses(self, schema: dict[str, Any], here: Path, change: str) -> None:

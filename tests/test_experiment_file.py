@@ -504,11 +504,16 @@ CASES = [
     (SHOW, "3", ": expected keys and values, found 3"),
     (SHOW, "{logs: first}", ".logs: expected a list, found 'first'"),
     (SHOW, "{logs: []}", ".logs: expected at least 1 in the list, found []"),
-    (SHOW, "{run: best}", ".run: expected a whole number, or 'median' or 'worst', found 'best'"),
+    (SHOW, "{run: mean}", ".run: expected a whole number, or 'median', 'worst' or 'best', or a list, found 'mean'"),
+    (SHOW, "{run: []}",
+     ".run: expected a whole number, or 'median', 'worst' or 'best', or at least 1 in the list, found []"),
+    (SHOW, "{run: [best, mean]}", ".run[1]: expected a whole number, or 'median', 'worst' or 'best', found 'mean'"),
+    (SHOW, "{run: [1, null]}", ".run[1]: expected a whole number, or 'median', 'worst' or 'best', found nothing"),
+    (SHOW, "{run: [best, 3, best]}", ".run: expected each run once, found best twice"),
     (SHOW, "{configurations: GT}", ".configurations: expected a list, found 'GT'"),
     (SHOW, "{configurations: []}", ".configurations: expected at least 1 in the list, found []"),
     (SHOW, "{configuration: [GT]}", ".configuration: unknown key; did you mean configurations?"),
-    (SHOW, "{run: -1}", ".run: expected at least 0, or 'median' or 'worst', found -1"),
+    (SHOW, "{run: -1}", ".run: expected at least 0, or 'median', 'worst' or 'best', or a list, found -1"),
 ]  # fmt: skip
 
 

@@ -24,4 +24,4 @@ def test_notebook_prints_what_it_shows(path: Path) -> None:
 
 
 def test_there_are_notebooks() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["01_the_paper", "02_your_own_fusion"]
+    assert [path.stem for path in NOTEBOOKS] == ["01_the_paper", "02_your_own_fusion", "03_reading_the_results"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
+from mcap.reader import make_reader
 from pyarrow import parquet
 
 import scenes
@@ -18,7 +20,9 @@ from copem_replay import replay as replays
 from copem_replay.check import read_logs
 from copem_replay.experiment import Experiment
 from copem_replay.results import write_results
-from copem_replay.run import Result, run, shown_logs, shown_run
+from copem_replay.run import Result, run
+from copem_replay.shown import shown_logs, shown_runs
+from copem_replay.write import RUN_RECORD
 from recordings import Obj, write_recording
 from scenes import experiment
 
@@ -225,29 +229,95 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
 
 def made_up(times: list[float | None]) -> Result:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
-    table = pd.DataFrame({"log": "scene", "run": range(len(times)), "time_to_detection_s": times})
+    of = {"log": "scene", "configuration": "PEM", "object_id": "a"}
+    table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
     ready = replays.prepare(scenes.oncoming_car(), experiment())
     return Result(table, pd.DataFrame(), (), (ready,), 9.0)
 
 
 @pytest.mark.parametrize(
-    ("times", "median", "worst"),
+    ("times", "best", "median", "worst"),
     [
-        ([3.0, 1.0, 2.0], 2, 0),
-        ([3.0, None, 2.0], 0, 1),  # never detected counts as the horizon
-        ([5.0, 1.0, 2.0, 5.0], 2, 3),
-        ([4.0], 0, 0),
+        ([3.0, 1.0, 2.0], 1, 2, 0),
+        ([3.0, None, 2.0], 2, 0, 1),  # never detected counts as the horizon
+        ([5.0, 2.0, 1.0, 5.0], 2, 1, 0),  # the lower median; of equal runs the first
+        ([4.0, 4.0 + 1e-9, 4.0 - 1e-9], 0, 0, 0),  # closer than instants are told apart: equal
+        ([4.0], 0, 0, 0),
     ],
 )
-def test_which_run_is_shown(times: list[float | None], median: int, worst: int) -> None:
+def test_which_run_is_shown(times: list[float | None], best: int, median: int, worst: int) -> None:
     result = made_up(times)
-    assert shown_run(experiment(show={"run": "median"}), result, "scene") == median
-    assert shown_run(experiment(show={"run": "worst"}), result, "scene") == worst
-    assert shown_run(experiment(show={"run": 0}), result, "scene") == 0
+    for which, expected in (("best", best), ("median", median), ("worst", worst), (0, 0)):
+        (shown,) = shown_runs(experiment(show={"run": which}), result, "scene")
+        assert (shown.run, shown.stem) == (expected, "replay")
     for nothing in ({"run": None}, None):
-        assert shown_run(experiment(show=nothing), result, "scene") is None
+        assert shown_runs(experiment(show=nothing), result, "scene") == ()
         assert shown_logs(experiment(show=nothing), result) == []
     assert shown_logs(experiment(), result) == ["scene"]
+
+
+def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
+    """Sums over two configurations and two objects: 4, 8, 4 and 8 s; the same run may be shown twice."""
+    times = [1.0, 1.0, 1.0, 1.0], [2.0, 2.0, 2.0, 2.0], [0.0, 1.0, 1.0, 2.0], [2.0, 2.0, 4.0, 0.0]
+    keys = [(name, one) for name in ("GT", "PEM") for one in ("a", "b")]
+    rows = [
+        {"log": "scene", "configuration": name, "object_id": one, "run": k, "time_to_detection_s": of_run[n]}
+        for k, of_run in enumerate(times)
+        for n, (name, one) in enumerate(keys)
+    ]
+    result = dataclasses.replace(made_up([]), table=pd.DataFrame(rows))
+    shown = shown_runs(experiment(show={"run": ["median", "worst", 0, "best"]}, runs=4), result, "scene")
+    over = "of 4 by time to detection summed over 2 configurations and 2 objects, the first of 2 equal"
+    assert [(one.run, one.why, one.stem) for one in shown] == [
+        (0, f"median {over}", "replay"),
+        (1, f"worst {over}", "replay_worst"),
+        (0, "", "replay_0"),
+        (0, f"best {over}", "replay_best"),
+    ]
+    # Of a log in which nothing is measured.
+    other = shown_runs(experiment(show={"run": ["worst", 3]}, runs=4), result, "other")
+    assert [(one.run, one.why) for one in other] == [
+        (0, "first, not worst, as no measured object has an onset"),
+        (3, ""),
+    ]
+
+
+def test_several_runs_of_several_logs(two_logs: list[Path], tmp_path: Path) -> None:
+    """A file each, in a folder each, that says which run it is and why."""
+    from rerun.chunk import RrdReader
+
+    seldom = {"p": [{"detection": {"kind": "constant", "probability": 0.1}}]}
+    units = {"units": {"ego": {"on": "ego", "pem": "p"}}, "configurations": {"PEM": {"units": "all"}}}
+    chosen = plan(show={"logs": ["all"], "run": ["worst", "best", 1]}, pems=seldom, **units)
+    recordings, _ = read_logs(chosen, two_logs, None)
+    result = run(chosen, recordings)
+    folder = tmp_path / "out"
+    for _ in range(2):  # what is there already goes
+        write_results(folder, chosen, recordings, result, overwrite=True)
+    stems = ["replay", "replay_best", "replay_1"]
+    files = {f"{stem}/{log}/drive.{kind}" for stem in stems for log in ("near", "far") for kind in ("mcap", "rrd")}
+    assert {p.relative_to(folder).as_posix() for p in folder.rglob("replay*/**/*") if p.is_file()} == files
+    said = json.loads((folder / "provenance.json").read_text())
+    shown = said["runs_shown"]["near/drive"]
+    assert [each["file"] for each in shown] == stems
+    assert said["run_shown"]["near/drive"] == shown[0]["run"]
+    time_s = result.table[result.table["log"] == "near/drive"].set_index("run")["time_to_detection_s"]
+    assert len(set(time_s)) > 1, "else it would not matter which is shown"
+    assert (time_s[shown[0]["run"]], time_s[shown[1]["run"]], shown[2]["run"]) == (time_s.max(), time_s.min(), 1)
+    names = set()
+    for each in shown:
+        with (folder / each["file"] / "near/drive.mcap").open("rb") as file:
+            (record,) = [m for m in make_reader(file).iter_metadata() if m.name == RUN_RECORD]
+        assert record.metadata["run"] == str(each["run"])
+        assert record.metadata["run_is"] == (each["run_is"] or "")
+        name = f"near/drive: run {each['run']}" + (f": {each['run_is']}" if each["run_is"] else "")
+        recording = RrdReader(folder / each["file"] / "near/drive.rrd")
+        (entry,) = recording.recordings()
+        names.add(entry.recording_id)
+        properties = [c.to_record_batch() for c in recording.stream() if c.entity_path.startswith("/__properties")]
+        told = [batch.column(n).to_pylist()[0] for batch in properties for n in batch.schema.names if "name" in n]
+        assert [name] in told
+    assert len(names) == 3, "else a viewer would take two of them for one"
 
 
 def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ what is in it.
 | `grid`, `sides`, `lists` | rows and lists of two configurations side by side |
 | `regret`, `figures`, `intervals` | metrics of pairs, and their intervals |
 | `notes`, `tables` | what is said |
+| `beside`, `merge` | one run of all of them in one recording: imported by name, as it replays |
 """
 
 from copem_replay.compare.comparison import Comparison, compare

@@ -11,6 +11,7 @@
 | `plots/position_error/<object>/<configuration>` | believed to true position at the instant the list is available |
 | `plots/known/<configuration>`, `truth` | how many of the measured objects the newest list holds, and the log |
 | `events/<configuration>`, `summary` | in words |
+| `…/difference/…`, `plots/error_difference` | where configurations are compared with a baseline (`differences.py`) |
 
 Columns are sent whole, an entity holds all its objects: hundreds of entities slow the viewer down. It shows the newest
 row of an entity until the next one, so an instant at which there is nothing has an empty row of its own.

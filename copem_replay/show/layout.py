@@ -32,9 +32,13 @@ NEAR_FAR_M = (20.0, 150.0)
 
 
 def blueprint(
-    replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int]
-) -> tuple[rrb.Blueprint, str]:
-    """Views of truth and configurations over plots and words; and a digest of all that it depends on."""
+    replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int],
+    baseline: str | None = None,
+) -> tuple[rrb.Blueprint, str]:  # fmt: skip
+    """Views of truth and configurations over plots and words; and a digest of all that it depends on.
+
+    With a `baseline` the differences of position errors to it have a plot of their own.
+    """
     import rerun.blueprint as rrb
 
     scene = replay.scene
@@ -43,7 +47,7 @@ def blueprint(
     controls = rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0, 0, 1), tracking_entity=follows)
     heard = {n: experiment.units_of(experiment.configurations[n]) for n in configurations[:SHOWN_CONFIGURATIONS]}
     views = [_view(name, units, controls) for name, units in heard.items()]
-    plots = [_plots(scene, k) for k in shown]
+    plots = [_plots(scene, k, baseline) for k in shown]
     bound = rrb.TimeRangeBoundary.absolute
     whole = rrb.TimeAxis(view_range=rrb.TimeRange(start=bound(seconds=0.0), end=bound(seconds=scene.end_s)))
     known = rrb.TimeSeriesView(origin="plots/known", name="Known objects", axis_x=whole)
@@ -80,6 +84,7 @@ def blueprint(
         follows,
         onset_ns,
         end_ns,
+        baseline,
     )
     return made, digest(repr(parts))
 
@@ -99,12 +104,14 @@ def _view(configuration: str, units: Sequence[str], eye: rrb.EyeControls3D) -> r
     )
 
 
-def _plots(scene: Scene, k: int) -> rrb.Horizontal:
+def _plots(scene: Scene, k: int, baseline: str | None) -> rrb.Horizontal:
     """Of one object."""
     import rerun.blueprint as rrb
 
     name = scene.object_ids[k]
     shares, errors = path_of("plots", "visible_share", name), path_of("plots", "position_error", name)
+    more = path_of("plots", "error_difference", name)
+    beside = [rrb.TimeSeriesView(origin=more, name=f"More error than {baseline} [m]")] if baseline is not None else []
     return rrb.Horizontal(
         rrb.TimeSeriesView(
             origin=shares,
@@ -113,6 +120,7 @@ def _plots(scene: Scene, k: int) -> rrb.Horizontal:
             axis_y=rrb.ScalarAxis(range=(-0.05, 1.05)),
         ),
         rrb.TimeSeriesView(origin=errors, name="Position error [m]"),
+        *beside,
         name=f"{name} {CLASSES[scene.object_class[k]]}",
     )
 
