@@ -74,9 +74,9 @@ def _poses(log: Log) -> list[dict[str, str]]:
     """Where the ego's poses may be, as `ego:` names it: odometry first, transforms last."""
     if not foreign(log):
         return []
-    from copem_replay.formats.cdr import DefinitionError
     from copem_replay.formats.known import schema_name
     from copem_replay.formats.poses import ODOMETRY, is_pose, poses_of
+    from copem_replay.formats.raw_values import DefinitionError
     from copem_replay.topics import gathered
 
     found: list[tuple[int, dict[str, str]]] = []

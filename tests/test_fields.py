@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from copem_replay.formats.fields import Class, Description, Fields, FieldsError, Listed, Stamp, Yaw, listed
-from copem_replay.formats.tree import JsonDefinition
+from copem_replay.formats.json_messages import JsonDefinition
 from copem_replay.tracks import CLASSES, VALUES
 from messages import SEPARATOR, classes, defined, ids, quaternion, serialised, values
 

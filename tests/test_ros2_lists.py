@@ -14,10 +14,11 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from copem_replay.formats.cdr import CdrDefinition
 from copem_replay.formats.fields import Listed, listed
+from copem_replay.formats.json_messages import JsonDefinition
+from copem_replay.formats.protobuf import ProtobufDefinition
 from copem_replay.formats.ros2_lists import DESCRIPTIONS
 from copem_replay.formats.scene_update import SCHEMAS, description
 from copem_replay.formats.shred import Definition
-from copem_replay.formats.tree import JsonDefinition, ProtobufDefinition
 from copem_replay.tracks import CLASSES
 from messages import SEPARATOR, classes, ids, quaternion, serialised, values
 
