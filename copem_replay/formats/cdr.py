@@ -7,7 +7,7 @@ the file says it. Of a message only the fields that are asked for are taken.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -45,6 +45,7 @@ class CdrDefinition:
         self._offers: dict[str, str] = {}
         self._arrays: dict[str, int] = {}  # paths of the arrays of numbers, and how many each has
         self._explored = 0
+        self._wide = False  # whether there are wide texts
         self._explore(self._name, "", ())
 
     def offers(self) -> dict[str, str]:
@@ -66,8 +67,24 @@ class CdrDefinition:
         for path in wanted:
             if path not in self._offers and not self.picks(path):
                 raise KeyError(path)
+        order = "be" if payloads and payloads[0][1:2] in (b"\0", b"\6") else "le"
+        found = self._walk(payloads, wanted, numbers, texts, f"utf-32-{order}")
+        if self._wide and not found.decoded.all():  # writers differ in how wide they are
+            other = self._walk(payloads, wanted, numbers, texts, f"utf-16-{order}")
+            return max(found, other, key=lambda one: int(one.decoded.sum()))
+        return found
+
+    def _walk(
+        self,
+        payloads: Sequence[bytes],
+        wanted: Sequence[str],
+        numbers: Collection[str],
+        texts: Collection[str],
+        wide: str,
+    ) -> Shredded:
+        """Messages taken apart, wide texts as `wide`."""
         levels = levels_to(wanted)
-        builder = Program(self._types, wanted, levels)
+        builder = Program(self._types, wanted, levels, wide)
         builder.add_type(self._name, "")
         program = builder.finished()
         level_ix = np.array([levels.index(level_of(path)) for path in wanted], dtype=np.int64)
@@ -108,6 +125,7 @@ class CdrDefinition:
         kind, detail = node
         if kind == BASE:
             self._offers[path] = "text" if base(detail[0]) in TEXT else "number"
+            self._wide |= detail[0] == "wstring"
         elif kind == NAME:
             self._explore(named(detail, self._types, self._name), path, inside)
         else:
@@ -146,7 +164,8 @@ def _parsed(text: str, name: str, encoding: str) -> dict[str, Any]:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     if encoding != "ros2idl":
-        return dict(get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name))
+        found = get_types_from_msg(_WIDE.sub("wstring", _SEPARATOR.sub("=" * 80, text)), name)
+        return {of: (constants, [(f, _widened(n)) for f, n in fields]) for of, (constants, fields) in found.items()}
     if shift := _FAR_SHIFT.search(text):  # rosbags would compute it, gigabytes long
         raise ValueError(f"a constant is shifted by {shift[1]}")
     types: dict[str, Any] = {}
@@ -154,6 +173,17 @@ def _parsed(text: str, name: str, encoding: str) -> dict[str, Any]:
         if part.strip():
             types.update(get_types_from_idl(_NOT_IDL.sub("", part)))
     return types
+
+
+_WIDE = re.compile(r"\bwstring<=[ \t]*\d+")
+
+
+def _widened(node: Any) -> Any:
+    """A node as it is meant: rosbags takes `wstring` for a type of the package."""
+    kind, detail = node
+    if kind == NAME:
+        return (BASE, ("wstring", 0)) if detail.endswith("/wstring") else node
+    return node if kind == BASE else (kind, (_widened(detail[0]), detail[1]))
 
 
 _FAR_SHIFT = re.compile(r"<<[\s(]*(\d{3,})")

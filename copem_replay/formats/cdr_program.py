@@ -28,7 +28,7 @@ BASES = {
     "float32": (4, "f4"),
     "float64": (8, "f8"),
 }
-TEXT = {"string": 1}
+TEXT = ("string", "wstring")
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """rosbags' kinds of node."""
 
@@ -53,10 +53,13 @@ def base(name: str) -> str:
 
 
 class Program:
-    """Instructions for a message, with the columns that `wanted` asks for."""
+    """Instructions for a message, with the columns that `wanted` asks for.
 
-    def __init__(self, types: Any, wanted: Sequence[str], levels: Sequence[str]) -> None:
-        self._types = types
+    `wide`: the codec of wide texts, of as many bytes per character as its number says.
+    """
+
+    def __init__(self, types: Any, wanted: Sequence[str], levels: Sequence[str], wide: str) -> None:
+        self._types, self._wide = types, wide
         self._column = {path: k for k, path in enumerate(wanted)}
         self._level = {name: k for k, name in enumerate(levels)}
         self._picked: dict[str, list[int]] = {}
@@ -133,8 +136,9 @@ class Program:
         column = self._column.get(path, -1)
         level = self._level.get(level_of(path), 0)
         if name in TEXT:
-            self._add(kernel.TEXT, column, TEXT[name], level)
-            self.kinds[path] = Kind("ended")
+            wide = name == "wstring"
+            self._add(kernel.TEXT, column, int(self._wide.split("-")[1]) // 8 if wide else 1, level)
+            self.kinds[path] = Kind(self._wide if wide else "ended")
             return
         size, how = BASES[name]
         self.kinds[path] = Kind("bool" if name == "bool" else how)

@@ -24,7 +24,8 @@ class Kind:
     """What the values of a column are.
 
     `how`: how NumPy reads the bits of a number (`f8`), or `bool`, `zigzag` (a signed number as protobuf's sint has it),
-    `text`, `ended` (a text up to the zeros at its end), `bytes`. `names`: of the numbers of an enumeration.
+    `text`, `ended` (a text up to the zeros at its end), `bytes`, or the codec of a wide text (`utf-16-le`). `names`: of
+    the numbers of an enumeration.
     """
 
     how: str
@@ -33,7 +34,7 @@ class Kind:
     @property
     def is_number(self) -> bool:
         """Whether its bits are a number."""
-        return self.how not in ("text", "ended", "bytes")
+        return self.how not in ("text", "ended", "bytes") and not self.how.startswith("utf")
 
 
 class RawColumn:
@@ -106,14 +107,16 @@ def _numbers_in(bits: Any, how: str) -> Any:
 
 def _number_in(text: bytes, how: str) -> float:
     try:
-        return float(_without_end(text, how).decode())
+        return float(_decoded(text, how))
     except ValueError:
         return np.nan
 
 
 def _word(text: bytes, how: str) -> str:
-    return text.hex() if how == "bytes" else _without_end(text, how).decode(errors="replace")
+    return text.hex() if how == "bytes" else _decoded(text, how)
 
 
-def _without_end(text: bytes, how: str) -> bytes:
-    return text if how == "text" else text.rstrip(b"\0")
+def _decoded(text: bytes, how: str) -> str:
+    if how.startswith("utf"):
+        return text.decode(how, errors="replace").rstrip("\0")
+    return (text if how == "text" else text.rstrip(b"\0")).decode(errors="replace")
