@@ -17,6 +17,7 @@ from copem_replay.formats.classes import class_named
 from copem_replay.formats.columns import Columns
 from copem_replay.formats.describe import Amount, Class, Description, Fields, Stamp, Yaw
 from copem_replay.formats.life import life_notes
+from copem_replay.formats.shapes import largest, outlined, rounded
 from copem_replay.formats.shred import (
     Definition,
     Shredded,
@@ -29,15 +30,10 @@ from copem_replay.formats.shred import (
 )
 from copem_replay.formats.stamps import nanoseconds
 from copem_replay.formats.wanted import FieldsError, Wanted
-from copem_replay.tracks import CLASSES, VALUES, Bool, Float, Int
+from copem_replay.tracks import CLASSES, Bool, Float, Int
 from copem_replay.wording import counted
 
 __all__ = ["Class", "Description", "Fields", "FieldsError", "Listed", "Stamp", "Yaw", "listed"]
-
-_SPHERE, _CYLINDER, _CONE = 2, 3, 4
-"""Types of shape_msgs/SolidPrimitive; a cylinder and a cone have a height and a radius."""
-_YAW = VALUES.index("yaw_rad")
-_SIZE = slice(VALUES.index("length_m"), VALUES.index("width_m") + 1)
 
 
 @dataclass(frozen=True)
@@ -182,22 +178,6 @@ class _Reader:
             meant &= np.array([word in values for word in found.words] + [False], dtype=bool)[found.code]
         return meant
 
-    def _largest(self, meant: Bool, values: Float) -> Bool:
-        """(P,) of the bodies of one thing the largest, the first of equal ones."""
-        of = self._description.largest_of
-        if of is None:
-            return meant
-        owner = rows_above(self._found, self._fields.objects, of)
-        volume = np.where(meant, np.nan_to_num(values[:, _SIZE.start : _SIZE.stop + 1]).prod(axis=1), -np.inf)
-        order = np.lexsort((-volume, owner))
-        first = np.ones(len(order), dtype=bool)
-        first[1:] = np.diff(owner[order]) != 0
-        largest = meant.copy()
-        largest[order[~first]] = False
-        if beside := int((meant & ~largest).sum()):
-            self._notes["cube", "beside a larger one of the same entity: left out"] += beside
-        return largest
-
     def _ids(self) -> Texts | None:
         """(P,) ids; None: objects have none."""
         if self._fields.id is None:
@@ -223,37 +203,19 @@ class _Reader:
         said: Bool = self.number(path) != 0
         return said
 
-    def _outlined(self, values: Float) -> None:
-        """Give those without length and width the box around their footprint."""
-        footprint = self._description.footprint
-        if footprint is None:
-            return
-        level = level_of(self._wanted.path(f"{footprint}.x"))
-        points = self._found.levels[level]
-        owner = rows_above(self._found, level, self._fields.objects)
-        least, most = (np.full((len(values), 2), end) for end in (np.inf, -np.inf))
-        for k, axis in enumerate("xy"):
-            along = points.numbers[self._wanted.path(f"{footprint}.{axis}")]
-            np.minimum.at(least[:, k], owner, along)
-            np.maximum.at(most[:, k], owner, along)
-        size = values[:, _SIZE]
-        flat = np.flatnonzero(~(size > 0).all(axis=1) & (most > least).all(axis=1))  # of no point: never
-        middle, yaw = (least[flat] + most[flat]) / 2, values[flat, _YAW]
-        values[flat, _SIZE] = most[flat] - least[flat]
-        values[flat, 0] += middle[:, 0] * np.cos(yaw) - middle[:, 1] * np.sin(yaw)
-        values[flat, 1] += middle[:, 0] * np.sin(yaw) + middle[:, 1] * np.cos(yaw)
-
-    def _rounded(self, values: Float) -> None:
-        """Give solids that are no boxes the box around them (shape_msgs/SolidPrimitive)."""
-        solid = self._description.solid
-        if solid is None:
-            return
-        kind, first, second = (self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2))))
-        ball, upright = kind == _SPHERE, (kind == _CYLINDER) | (kind == _CONE)
-        across = 2.0 * np.where(ball, first, second)
-        height = np.where(ball, across, first)
-        round_ = ball | upright
-        values[round_, _SIZE.start : _SIZE.stop + 1] = np.stack([across, across, height], axis=1)[round_]
+    def _shaped(self, values: Float, meant: Bool) -> Bool:
+        """Give all the boxes that their shapes say; (P,) which are meant all the same."""
+        described, objects = self._description, self._fields.objects
+        if described.footprint is not None:
+            outlined(values, self._found, objects, self._wanted.path(described.footprint))
+        if (solid := described.solid) is not None:
+            rounded(values, *(self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2)))))
+        if described.largest_of is None:
+            return meant
+        chosen = largest(values, meant, self._found, objects, described.largest_of)
+        if beside := int((meant & ~chosen).sum()):
+            self._notes["cube", "beside a larger one of the same entity: left out"] += beside
+        return chosen
 
     def listed(self, log_time_ns: Int) -> Listed:
         """All columns."""
@@ -281,9 +243,7 @@ class _Reader:
             ],
             axis=1,
         )
-        self._outlined(values)
-        self._rounded(values)
-        taken = self._largest(taken, values)
+        taken = self._shaped(values, taken)
         message = found.levels[""].parent[rows_above(found, fields.objects, "")]
         ids = self._ids()
         nameless = np.zeros(len(taken), dtype=bool) if ids is None else (ids.code < 0) & taken
