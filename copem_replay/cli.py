@@ -74,19 +74,22 @@ def info(
 def init(log: Annotated[Path, typer.Argument(metavar="LOG", help="Recording (MCAP).")]) -> int:
     """Print an experiment that replays a recording, with comments: copem-replay init LOG > experiment.yaml.
 
-    Its paths are relative to where you are. Ends 2 when no list of true objects could be read.
+    Its paths are relative to where you are. Where no list is known by name, `read:` is proposed from the names of
+    fields. Ends 2 when no list of true objects could be read.
     """
     from copem_replay.info import survey
-    from copem_replay.init import commented
+    from copem_replay.init import commented, proposed, unfinished
 
     found = survey(log)
-    if not found["readable"]:
+    text = commented(found) if found["readable"] else proposed(found)
+    if text is None:
+        print(unfinished(found), end="")
         raise InputError(found["reason"])
     try:
         str(log).encode()
     except UnicodeEncodeError:
         raise InputError(f"{log}: its path is not UTF-8: no experiment could name it") from None
-    print(commented(found), end="")
+    print(text, end="")
     return 0
 
 

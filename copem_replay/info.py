@@ -13,7 +13,7 @@ from copem_replay import container
 from copem_replay.container import Channel, Log
 from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
-from copem_replay.init import short
+from copem_replay.init import read_block, short
 from copem_replay.read import Recording, choose_topic, foreign, is_truth, moving_ids, read_log, truth_topics
 from copem_replay.repair import MAX_GAP_S
 from copem_replay.suggest import suggestion
@@ -21,6 +21,7 @@ from copem_replay.tracks import CLASSES, Bool, Float, Scene
 from copem_replay.wording import counted, printable
 
 if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
+    from copem_replay.formats.describe import Fields
     from copem_replay.lists import RecordedLists
 
 _ROLES = {
@@ -38,11 +39,13 @@ def survey(path: Path | str) -> dict[str, Any]:
 
     `readable`: whether a list of true objects could be read; if not, `reason` says why in a line, and `topics` what
     the file holds all the same. `truth` has an entry per topic that could be the truth: one, unless there is a
-    choice to make (then `choice` says so). A bad recording raises nothing.
+    choice to make (then `choice` says so). `proposals`: where no list is known by name, what could be read by naming
+    fields. A bad recording raises nothing.
     """
     found: dict[str, Any] = {"recording": Path(path).name, "readable": False, "reason": None, "choice": None}
     # damage: of the file, what is wrong with it
     found |= {"damage": None, "topics": [], "truth": [], "log": str(path), "experiment": None}
+    found["proposals"] = []
     try:
         log = container.open_log(Path(path))
     except RecordingError as error:
@@ -53,6 +56,8 @@ def survey(path: Path | str) -> dict[str, Any]:
     except RecordingError as error:
         topics = list(truth_topics(log))
         found["choice" if topics else "reason"] = str(error)
+        if not topics:
+            return found | {"proposals": _proposals(log, found["topics"])}
     failures = []
     beside = [t["topic"] for t in found["topics"] if t["role"] == "unit"]
     for topic in topics:
@@ -75,6 +80,9 @@ def describe(survey: dict[str, Any]) -> list[str]:
     for truth in survey["truth"]:
         lines += _truth_lines(truth)
     lines += [survey["choice"]] if survey["choice"] else []
+    for proposal in survey["proposals"]:
+        lines.append(f"{proposal['topic']} may be read as a list of objects, by the names of its fields:")
+        lines += [f"  {line}" for line in read_block(proposal)]
     if survey["experiment"]:
         lines.append(f"experiment; with comments: copem-replay init {shlex.quote(survey['log'])} > experiment.yaml")
         lines += [f"  {line}" for line in survey["experiment"].splitlines()]
@@ -141,7 +149,26 @@ def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:
     return found
 
 
-def _truth(log: Log, recording: Recording, topics: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _proposals(log: Log, topics: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Lists by the names of their fields; `truth`: what is read so, as in a survey, null where not all was found."""
+    if not foreign(log):
+        return []
+    from copem_replay.formats.describe import Fields
+    from copem_replay.proposals import proposals
+
+    made = []
+    for proposal, recording in proposals(log, log.path.stem):
+        truth = None
+        if recording is not None:
+            fields = Fields.model_validate({k: v for k, v in proposal["read"].items() if k != "topic"})
+            truth = _truth(log, recording, topics, fields)
+        made.append(proposal | {"truth": truth})
+    return made
+
+
+def _truth(
+    log: Log, recording: Recording, topics: Sequence[dict[str, Any]], fields: Fields | None = None
+) -> dict[str, Any]:
     """One list of true objects, and what the other topics are to it."""
     scene, truth = recording.scene, recording.truth
     poses = [t["topic"] for t in topics if t["role"] == "poses" and t["messages"]]
@@ -171,7 +198,7 @@ def _truth(log: Log, recording: Recording, topics: Sequence[dict[str, Any]]) -> 
         "notes": list(recording.notes),
         "vehicles": moving_ids(scene, shown=6),
         "units": list(_units(log, recording, units)),
-        "suggested": suggestion(log, recording),
+        "suggested": suggestion(log, recording, fields),
     }
 
 

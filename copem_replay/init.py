@@ -89,6 +89,54 @@ def commented(survey: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def proposed(survey: dict[str, Any]) -> str | None:
+    """The experiment on a list that is read by the names of its fields; None: of no proposal all needed was found."""
+    whole = [proposal for proposal in survey["proposals"] if proposal["truth"] is not None]
+    if not whole:
+        return None
+    best = max(whole, key=lambda proposal: proposal["truth"]["states"])
+    return commented(survey | {"truth": [best["truth"]], "proposals": [best]})
+
+
+def unfinished(survey: dict[str, Any]) -> str:
+    """`read:` of each proposal as comments, with what is missing and what the messages have."""
+    lines = []
+    for proposal in survey["proposals"]:
+        lines += [f"# {_plain(proposal['topic'])} ({_plain(proposal['schema'])}) may be a list of objects:"]
+        lines += [f"# {line}" for line in read_block(proposal)]
+        lines += [f"# its messages have: {_plain(', '.join(proposal['offers']))}"]
+        lines += [f"# {_plain(proposal['problem'])}"] if proposal["problem"] else []
+    return "\n".join(lines) + "\n" if lines else ""
+
+
+def read_block(proposal: dict[str, Any]) -> list[str]:
+    """`read:` as it was proposed, each key with what else it could be."""
+    read, others = proposal["read"], proposal["others"]
+    lines = ["read:   # proposed from the names of its fields: look at each"]
+    for key, value in read.items():
+        line = f"  {key}: {_value(value)}"
+        said = [f"or {_plain(', '.join(others[key][:_OTHERS]))}"] if key in others else []
+        said += [_ON_KEYS[key]] if key in _ON_KEYS else []
+        lines.append(line + (f"   # {'; '.join(said)}" if said else ""))
+    lines += [f"  # {key}: …   # needed, and not found: {_NEEDED.get(key, 'a path')}" for key in proposal["missing"]]
+    return lines
+
+
+_ON_KEYS = {
+    "stamp": "without it: when it was logged",
+    "class": "{path: …, map: {1: car}} where values are not names",
+    "z_m": "of the centre of the box",
+    "vx_mps": "along the axes of the frame; `velocity: object`: along the object",
+}
+_NEEDED = dict.fromkeys(("length_m", "width_m"), "a path, or a number that goes for all")
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_value(inner)}" for key, inner in value.items()) + "}"
+    return quoted(str(value))
+
+
 _ONBOARD = [
     "  onboard:",
     "    - when: {range_m: [0, 80], azimuth_deg: [-60, 60]}   # far ahead",
@@ -112,6 +160,8 @@ def _objects(truth: dict[str, Any]) -> str:
 
 
 def _read(survey: dict[str, Any], truth: dict[str, Any]) -> Iterator[str]:
+    if survey["proposals"]:
+        yield from read_block(survey["proposals"][0])
     if not survey["choice"]:
         return
     others = [t["topic"] for t in survey["truth"] if t["topic"] != truth["topic"]]

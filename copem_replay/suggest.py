@@ -5,7 +5,7 @@ Guesses from what is in the log, to begin with; each says why.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from copem_replay.container import BrokenIndexError, Log
 from copem_replay.errors import RecordingError
 from copem_replay.read import Recording, foreign, read_log
 from copem_replay.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
+
+if TYPE_CHECKING:
+    from copem_replay.formats.describe import Fields
 
 RANGE_M = 50.0
 """`in_range` of the contract: nearer than this to the ego, an object is measured."""
@@ -25,11 +28,11 @@ _DRIVEN = ("car", "van", "truck", "bus", "vehicle", "motorcycle")
 _FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle")  # as drivers name the vehicle's own
 
 
-def suggestion(log: Log, recording: Recording) -> dict[str, Any]:
+def suggestion(log: Log, recording: Recording, fields: Fields | None = None) -> dict[str, Any]:
     """Plain data: `ego` as the experiment has it (null: the host vehicle of the log) and `ego_why`; `classes` that are
     measured, null for all that moves, and the `onset`; `masts`: two places to look on from, the freer one first.
     """
-    ego, why, recording = _ego(log, recording)
+    ego, why, recording = _ego(log, recording, fields)
     scene, truth = recording.scene, recording.truth
     objects = truth.row_object_ix
     number = scene.ego_ix if ego is None or isinstance(ego, dict) else scene.object_number.get(ego, -1)
@@ -45,7 +48,7 @@ def suggestion(log: Log, recording: Recording) -> dict[str, Any]:
     }
 
 
-def _ego(log: Log, recording: Recording) -> tuple[str | dict[str, str] | None, str, Recording]:
+def _ego(log: Log, recording: Recording, fields: Fields | None) -> tuple[str | dict[str, str] | None, str, Recording]:
     """The ego as an experiment has it, why, and the recording with it."""
     scene = recording.scene
     if recording.around is not None and recording.around.ego is not None:
@@ -61,7 +64,8 @@ def _ego(log: Log, recording: Recording) -> tuple[str | dict[str, str] | None, s
         from copem_replay.experiment import EgoTopic
 
         try:
-            again = read_log(log, name=scene.log, topic=recording.topic, ego=EgoTopic.model_validate(place))
+            asked = EgoTopic.model_validate(place)
+            again = read_log(log, name=scene.log, topic=recording.topic, fields=fields, ego=asked)
         except (RecordingError, BrokenIndexError):
             continue
         if again.scene.ego_ix >= 0:
@@ -74,9 +78,9 @@ def _poses(log: Log) -> list[dict[str, str]]:
     """Where the ego's poses may be, as `ego:` names it: odometry first, transforms last."""
     if not foreign(log):
         return []
-    from copem_replay.formats.cdr import DefinitionError
     from copem_replay.formats.known import schema_name
     from copem_replay.formats.poses import ODOMETRY, is_pose, poses_of
+    from copem_replay.formats.raw_values import DefinitionError
     from copem_replay.topics import gathered
 
     found: list[tuple[int, dict[str, str]]] = []

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from copem_replay.container import Channel, Log
 from copem_replay.errors import RecordingError
 from copem_replay.experiment import EgoTopic
-from copem_replay.formats.cdr import DefinitionError
 from copem_replay.formats.columns import LAST_NS, Columns
 from copem_replay.formats.fields import Description, Fields, FieldsError, Listed, listed
 from copem_replay.formats.known import definition_of, description_of, is_list, schema_name
 from copem_replay.formats.poses import ODOMETRY, Poses, is_pose, poses_of
+from copem_replay.formats.raw_values import DefinitionError
 from copem_replay.frames import Course, Frames, course_of, yaw_of
 from copem_replay.tracks import CLASSES, VALUES, Float
 from copem_replay.wording import counted

@@ -1,16 +1,29 @@
-"""Lists of a unit in any format but OSI's, as they were recorded: captured and arriving at their stamps."""
+"""Lists of a unit in any format but OSI's, as they were recorded: captured and arriving at their stamps.
+
+What this project wrote beside its own lists (`…/detail`) says when they were captured, and what they have no fields
+for.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from copem_replay import container
+from copem_replay.formats import detail
+from copem_replay.formats.columns import LAST_NS
 from copem_replay.formats.fields import Listed
+from copem_replay.formats.known import definition_of, schema_name
+from copem_replay.formats.raw_values import DefinitionError
+from copem_replay.formats.ros2_definitions import STRING
+from copem_replay.formats.shred import take_apart
 from copem_replay.lists import RecordedLists, as_tracks
-from copem_replay.topics import Surroundings, in_world, known_lists, lists_of, surroundings
-from copem_replay.tracks import UNCERTAINTIES, Scene
+from copem_replay.topics import Surroundings, gathered, in_world, known_lists, lists_of, surroundings
+from copem_replay.tracks import UNCERTAINTIES, VALUES, Bool, Float, Int, Scene
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -29,10 +42,65 @@ def _read(log: container.Log, topic: str, scene: Scene, around: Surroundings | N
         return None
     mine = [c for c in channels if c.schema == channels[0].schema]
     around = around or surroundings(log, None, seek_ego=False)
-    return _recorded(in_world(lists_of(log, mine, None), around, f"{log.path}: {topic}"), topic, scene)
+    found = in_world(lists_of(log, mine, None), around, f"{log.path}: {topic}")
+    return _recorded(found, _details(log, topic), topic, scene)
 
 
-def _recorded(found: Listed, topic: str, scene: Scene) -> RecordedLists:
+def _details(log: container.Log, topic: str) -> dict[int, dict[str, Any]]:
+    """What is beside the lists on a topic, by the time at which each was available."""
+    beside = f"{topic.removesuffix('/objects')}/detail"
+    channels = [c for c in log.channels if c.topic == beside and c.messages and schema_name(c) == STRING]
+    found: dict[int, dict[str, Any]] = {}
+    for channel in channels:
+        payloads = gathered(log, frozenset({channel.number})).payloads[channel.number]
+        try:
+            said = take_apart(definition_of(channel, payloads), payloads, texts=["data"])
+        except (DefinitionError, KeyError):  # some other String
+            continue
+        for word in said.levels[""].texts["data"].words:
+            try:
+                content = detail.parse(word.encode())
+                found[int(content["available_ns"])] = {**content, "objects": list(content["objects"])}
+            except (ValueError, TypeError, KeyError, RecursionError):  # not written by us
+                continue
+    return found
+
+
+def _captured(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tuple[Int, Bool]:
+    """(F,) when lists available at `stamps` were captured, and whether that is said."""
+    captured, known = stamps.copy(), np.zeros(len(stamps), dtype=bool)
+    for k, stamp in enumerate(stamps.tolist()):
+        said = details.get(stamp, {}).get("captured_ns")
+        if isinstance(said, int) and abs(said) <= LAST_NS:
+            captured[k], known[k] = said, True
+    return captured, known
+
+
+def _with_details(found: Listed, details: Mapping[int, Mapping[str, Any]]) -> tuple[Listed, Float]:
+    """The lists with sizes and existence as they were believed, and (P, uncertainties) variances, NaN: not said."""
+    columns = found.columns
+    values, existence = columns.values.copy(), found.existence.copy()
+    variances = np.full((len(values), len(UNCERTAINTIES)), np.nan)
+    ends = np.cumsum(columns.rows)
+    for stamp, number, end in zip(columns.stamp_ns.tolist(), columns.rows.tolist(), ends.tolist(), strict=True):
+        items = details.get(stamp, {}).get("objects", ())
+        if len(items) != number:  # objects without a place are left out
+            continue
+        for row, item in zip(range(end - number, end), items, strict=True):
+            for name in ("length_m", "width_m"):
+                values[row, VALUES.index(name)] = _number(item, name, values[row, VALUES.index(name)])
+            existence[row] = _number(item, "existence", existence[row])
+            variances[row] = [_number(item, name, np.nan) for name in UNCERTAINTIES]
+    return replace(found, columns=replace(columns, values=values), existence=existence), variances
+
+
+def _number(item: Any, name: str, otherwise: float) -> float:
+    value = item.get(name) if isinstance(item, dict) else None
+    return float(value) if isinstance(value, float) else otherwise
+
+
+def _recorded(found: Listed, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene) -> RecordedLists:
+    found, beside = _with_details(found, details)
     columns = found.columns
     by_time = np.argsort(columns.stamp_ns, kind="stable")
     place = np.empty_like(by_time)
@@ -42,13 +110,14 @@ def _recorded(found: Listed, topic: str, scene: Scene) -> RecordedLists:
     order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
     covariance = found.covariance_m2[order]
     said = np.isfinite(covariance).all(axis=1) & (covariance[:, 0] > 0) & (covariance[:, 2] > 0)
-    variances = np.zeros((len(order), len(UNCERTAINTIES)))
-    variances[:, :3] = np.where(said[:, None], covariance, 0.0)
+    variances = np.nan_to_num(beside[order])
+    variances[:, :3] = np.where(said[:, None], covariance, 0.0)  # turned with its list
     stamps = columns.stamp_ns[by_time]
+    captured, capture_said = _captured(stamps, details)
     tracks = as_tracks(
         topic,
         scene,
-        np.stack([stamps, stamps], axis=1),
+        np.stack([captured, stamps], axis=1),
         np.arange(len(order) + 1),
         np.full(len(order), -1),
         frame[order],
@@ -61,6 +130,6 @@ def _recorded(found: Listed, topic: str, scene: Scene) -> RecordedLists:
         found.probability[order],
         columns.object_ix[order] if found.named else np.full(len(order), -1),
         said,
-        np.zeros(len(stamps), dtype=bool),
+        capture_said,
         int((~placed).sum()),
     )

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from copem_replay.formats.cdr import CdrDefinition, DefinitionError
+from copem_replay.formats.cdr import CdrDefinition
+from copem_replay.formats.raw_values import DefinitionError
 from copem_replay.formats.shred import Shredded, level_of, rows_above, take_apart
 from messages import SEPARATOR, defined, serialised, texts
 
@@ -330,7 +331,7 @@ def test_batches_of_messages_are_one_table(monkeypatch: pytest.MonkeyPatch) -> N
     payloads = [serialised(text, m) for m in made]
     payloads.insert(7, b"\0\1\0\0")
     one = take_apart(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
-    monkeypatch.setattr("copem_replay.formats.cdr._BATCH_BYTES", 60)
+    monkeypatch.setattr("copem_replay.formats.shred.BATCH_BYTES", 60)
     many = take_apart(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
     assert one.decoded.tolist() == many.decoded.tolist() == [k != 7 for k in range(21)]
     for name, level in one.levels.items():
@@ -365,13 +366,57 @@ def test_no_messages() -> None:
     assert texts(found.levels["b[]"].texts["b[].s"]) == []
 
 
+@pytest.mark.parametrize("order", ["le", "be"])
+@pytest.mark.parametrize("codec", ["utf-16", "utf-32"])
+@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
+def test_wide_texts(order: str, codec: str, encoding: str) -> None:
+    """By hand: the number of characters, and two or four bytes each; which, the message does not say."""
+    text = "uint8 a\nwstring b\nwstring<=9 c\nuint16 d\nwstring[] e\nfloat64 f"
+    if encoding == "ros2idl":
+        text = (
+            "module p { module msg { struct A { uint8 a; wstring b; wstring<9> c; uint16 d; "
+            "sequence<wstring> e; double f; }; }; };"
+        )
+    sign = "<" if order == "le" else ">"
+
+    def message(*said: str) -> bytes:
+        out = bytearray(b"\0\1\0\0" if order == "le" else b"\0\0\0\0")
+
+        def put(size: int, data: bytes) -> None:
+            out.extend(bytes(-(len(out) - 4) % size) + data)
+
+        def wide(word: str) -> None:
+            data = word.encode(f"{codec}-{order}")
+            put(4, struct.pack(f"{sign}I", len(data) // (2 if codec == "utf-16" else 4)) + data)
+
+        put(1, b"\7")
+        wide(said[0])
+        wide(said[1])
+        put(2, struct.pack(f"{sign}H", 513))
+        put(4, struct.pack(f"{sign}I", len(said) - 2))
+        for word in said[2:]:
+            wide(word)
+        put(8, struct.pack(f"{sign}d", 0.1))
+        return bytes(out)
+
+    payloads = [message("Fußgänger", "", "a"), message("x", "12.5", "ĀЖ", "日本")]
+    found = take_apart(defined(text, encoding=encoding), payloads, ["a", "c", "d", "f"], ["b", "c", "e[]"])
+    assert found.decoded.all()
+    assert texts(found.levels[""].texts["b"]) == ["Fußgänger", "x"]
+    assert texts(found.levels[""].texts["c"]) == ["", "12.5"]
+    assert texts(found.levels["e[]"].texts["e[]"]) == ["a", "ĀЖ", "日本"]
+    level = found.levels[""].numbers
+    assert (level["a"].tolist(), level["d"].tolist(), level["f"].tolist()) == ([7, 7], [513, 513], [0.1, 0.1])
+    assert level["c"][1] == 12.5
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
         ("A again", "nested without end"),
         ("B b\n" + SEPARATOR + "MSG: p/B\nA a", "nested without end"),
         ("B b", "lacks p/msg/B"),
-        ("wstring a", "wstring"),
+        ("wchar a", "wchar"),
         ("uint8[0] a", "array of 0"),
         ("uint8[-5] a", "array of -5"),
         ("B[99999999999] a\n" + SEPARATOR + "MSG: p/B\nuint8 x", "array of 99999999999"),

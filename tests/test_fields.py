@@ -10,9 +10,10 @@ import pytest
 from pydantic import ValidationError
 
 from copem_replay.formats.fields import Class, Description, Fields, FieldsError, Listed, Stamp, Yaw, listed
-from copem_replay.formats.tree import JsonDefinition
+from copem_replay.formats.json_messages import JsonDefinition
 from copem_replay.tracks import CLASSES, VALUES
 from messages import SEPARATOR, classes, defined, ids, quaternion, serialised, values
+from test_shred import OBJECTS, in_protobuf
 
 LEAST: dict[str, Any] = {"objects": "o[]", "x_m": "x", "y_m": "y", "length_m": 4.5, "width_m": 2}
 OBJECT: dict[str, Any] = {"x": 1.0, "y": 2.0}
@@ -148,6 +149,16 @@ def test_class_probabilities() -> None:
     assert one_for_all.probability[0, CLASSES.index("car")] == pytest.approx(0.5)
 
 
+def test_enumerations_by_number_and_by_name() -> None:
+    definition, payload = in_protobuf(OBJECTS, "List")
+    content = {"objects": [{"kind": k, "place": {"x": 1, "y": 2}} for k in ("CAR", "PERSON", "UNKNOWN", 5)]}
+    said = {"path": "kind", "map": {1: "truck", "PERSON": "animal", 7: "bus", 5: "trailer", "0": "van"}}
+    fields = {"objects": "objects[]", "x_m": "place.x", "y_m": "place.y", "length_m": 4, "width_m": 2, "class": said}
+    description = Description(Fields.model_validate(fields))
+    found = listed(definition, description, [payload(content)], np.array([1]))
+    assert classes(found) == ["truck", "animal", "van", "trailer"]  # a name goes before a number
+
+
 def test_class_among_keys_and_values() -> None:
     keys = {"class": {"path": "m[].v", "key": "m[].k", "keys": ["class", "label"]}}
     said = [
@@ -251,6 +262,31 @@ def test_stamps_of_one_number(unit: str, said: Any, expected: int) -> None:
     assert stamps({"stamp": {"path": "h", "unit": unit}}, said) == ([expected], [True], ())
     if unit == "s":
         assert stamps({"stamp": "h"}, said) == ([expected], [True], ())
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ("1970-01-01T00:00:01Z", 10**9),
+        ("2018-08-01T21:20:03.547590123Z", 1533158403547590123),
+        ("2018-08-01T21:20:03.547590123", 1533158403547590123),  # without a zone: UTC
+        ("2018-08-01 23:20:03,5+02:00", 1533158403500000000),
+        ("2018-08-01T16:50:03-0430", 1533158403000000000),
+        ("2018-08-01t21:20:03 UTC", 1533158403000000000),
+        ("1969-12-31T23:59:59.25Z", -750000000),
+        ("2024-02-29T00:00:00.0000000004Z", 1709164800000000000),
+    ],
+)
+def test_stamps_as_iso_8601_has_them(said: str, expected: int) -> None:
+    assert stamps({"stamp": "h"}, said) == ([expected], [True], ())
+    assert stamps({"stamp": {"path": "h", "unit": "ms"}}, said) == ([expected], [True], ())
+
+
+def test_dates_that_are_none() -> None:
+    said = ["2018-02-30T00:00:00Z", "2018-08-01", "2018-08-01T25:00:00Z", "T", "٢٠١٨-08-01T00:00:00Z"]
+    assert stamps({"stamp": "h"}, *said) == ([5] * 5, [False] * 5, ())
+    note = "1 message with an impossible time stamp: the time of logging taken"
+    assert stamps({"stamp": "h"}, "9999-12-31T23:59:59-23:59") == ([5], [False], (note,))
 
 
 def test_stamps_that_are_none() -> None:

@@ -65,6 +65,7 @@ def test_survey(path):
                 "role": "poses",
             },
         ],
+        "proposals": [],
         "truth": [
             {
                 "topic": "truth",

@@ -14,10 +14,11 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from copem_replay.formats.cdr import CdrDefinition
 from copem_replay.formats.fields import Listed, listed
+from copem_replay.formats.json_messages import JsonDefinition
+from copem_replay.formats.protobuf import ProtobufDefinition
 from copem_replay.formats.ros2_lists import DESCRIPTIONS
 from copem_replay.formats.scene_update import SCHEMAS, description
 from copem_replay.formats.shred import Definition
-from copem_replay.formats.tree import JsonDefinition, ProtobufDefinition
 from copem_replay.tracks import CLASSES
 from messages import SEPARATOR, classes, ids, quaternion, serialised, values
 
@@ -338,7 +339,14 @@ def test_derived_objects() -> None:
         "classification_certainty": 255,
         "classification_age": 0,
     }
+    round_ = {
+        kind: {**item, "id": kind, "shape": {**item["shape"], "type": kind, "dimensions": dimensions}}
+        for kind, dimensions in ((2, [0.5]), (3, [1.8, 0.25]), (4, [0.75, 0.2]))
+    }
     other = {**item, "id": 7, "shape": {**item["shape"], "dimensions": []}, "classification": 9}
+    solids = written("derived_object_msgs/msg/ObjectArray", text, {"header": HEADER, "objects": [*round_.values()]})
+    assert values(solids, "length_m") == values(solids, "width_m") == [1, 0.5, 0.4]  # a sphere, a cylinder, a cone
+    assert values(solids, "height_m") == [1, 1.8, 0.75]
     message = {"header": HEADER, "objects": [item, other]}
     found = written("derived_object_msgs/msg/ObjectArray", text, message)
     assert ids(found) == ["4294967295", "7"]
@@ -448,18 +456,77 @@ def in_json() -> tuple[Definition, list[bytes]]:
 def test_scene_updates(encoded: Any) -> None:
     definition, payloads = encoded()
     found = listed(definition, description(definition.offers()), payloads, np.array([5, 6]))
-    assert ids(found) == ["a", "b", "b"]
-    assert classes(found) == ["car", "pedestrian", "pedestrian"]
-    assert found.columns.rows.tolist() == [3, 0]
+    assert ids(found) == ["a", "b"]
+    assert classes(found) == ["car", "pedestrian"]
+    assert found.columns.rows.tolist() == [2, 0]
     assert found.columns.stamp_ns.tolist() == [STAMP, 6]
     assert found.columns.stamped.tolist() == [True, False]
-    assert [found.frames[k] for k in found.frame_code] == ["map"] * 3
-    assert values(found, "x_m") == [1, 1, 1]
-    assert values(found, "yaw_rad") == [0.5, 0.5, 0.5]
-    assert values(found, "length_m") == [4, 4, 0.5]
-    assert values(found, "height_m") == [1.5, 1.5, 1.8]
-    assert values(found, "vx_mps") == [None] * 3
-    assert found.columns.notes == ()
+    assert [found.frames[k] for k in found.frame_code] == ["map"] * 2
+    assert values(found, "x_m") == [1, 1]
+    assert values(found, "yaw_rad") == [0.5, 0.5]
+    assert values(found, "length_m") == [4, 4]
+    assert values(found, "height_m") == [1.5, 1.5]
+    assert values(found, "vx_mps") == [None] * 2
+    assert found.columns.notes == ("1 cube beside a larger one of the same entity: left out", *GONE[encoded.__name__])
+
+
+def body(size: float, x: float = 0) -> dict[str, Any]:
+    return {"pose": {"position": xyz(x, 0, 0), "orientation": quaternion(0)}, "size": xyz(size, size, size)}
+
+
+def test_the_largest_cube_of_an_entity() -> None:
+    """Those behind it in the list, too; of equal ones the first; one without a size is smallest."""
+    cubes = [[body(1), body(3, 5), body(2)], [body(2, 6), body(2, 7)], [{**body(9), "size": {"x": 9}}, body(1, 8)]]
+    entities = [{"id": str(k), "cubes": of} for k, of in enumerate(cubes)]
+    definition = JsonDefinition(payloads := [json.dumps({"entities": entities}).encode()])
+    found = listed(definition, description(definition.offers()), payloads, np.array([5]))
+    assert ids(found) == ["0", "1", "2"]
+    assert values(found, "x_m") == [5, 6, 8]
+    assert found.columns.notes == ("4 cubes beside a larger one of the same entity: left out",)
+
+
+FORCE = "in force from earlier messages and not said again: not taken, a list holds what its message says"
+GONE = dict.fromkeys(["in_ros2", "in_json"], ("3 entities deleted",))
+GONE |= {"in_protobuf": (f"2 states {FORCE}", "1 entity deleted")}
+
+
+@pytest.mark.parametrize(
+    ("messages", "notes"),
+    [
+        (["a b", "a b", "a b"], ()),  # as most do
+        (["a b -", "a b -", "b a -"], ()),  # all deleted, and said anew
+        (["a b", "a", "a"], (f"2 states {FORCE}",)),
+        (["a", "b", "b", "a"], (f"3 states {FORCE}",)),  # a in two, b in the last
+        (["a b", "a -", "a -", "a b"], ("1 entity deleted",)),
+        (["a b", "-a b", "b"], ("1 entity deleted",)),
+        (["a b", "-a a b", "a b"], ()),  # deleted before it is said again
+        (["a b", "b", "-a b", "b"], (f"1 state {FORCE}", "1 entity deleted")),
+        (["a b", "-c a", "-b", ""], (f"3 states {FORCE}", "1 entity deleted")),
+        (["a/15 b", "b", "b", "b"], (f"1 state {FORCE}", "1 entity over their lifetime")),
+        (["a/15 b", "-a b", "b", "b"], ("1 entity deleted",)),
+        (["a/5 b", "a/5 b", "b"], ("1 entity over their lifetime",)),
+    ],
+)
+def test_entities_that_are_not_said_again(messages: list[str], notes: tuple[str, ...]) -> None:
+    """A second apart; `-`: all are deleted, `-a`: a is; `a/15`: with a lifetime of 1.5 s."""
+    said = []
+    for k, text in enumerate(messages):
+        at = {"sec": k, "nsec": 0}
+        entities, deletions = [], []
+        for word in text.split():
+            if word.startswith("-"):
+                deletions.append({"timestamp": at, "type": 1 if word == "-" else 0, "id": word[1:]})
+                continue
+            name, _, tenths = word.partition("/")
+            whole, tenth = divmod(int(tenths or 0), 10)
+            lifetime = {"sec": whole, "nsec": tenth * 10**8}
+            entities.append({"id": name, "timestamp": at, "lifetime": lifetime, "cubes": [body(1)]})
+        said.append(json.dumps({"deletions": deletions, "entities": entities}).encode())
+    definition = JsonDefinition(said)
+    logged = np.arange(len(said)) * 10**9
+    found = listed(definition, description(definition.offers()), said, logged)
+    assert found.columns.rows.tolist() == [sum(w[0] != "-" for w in text.split()) for text in messages]
+    assert found.columns.notes == notes
 
 
 def test_json_scenes_may_leave_out_much() -> None:

@@ -13,7 +13,9 @@ from google.protobuf import descriptor_pb2, descriptor_pool, json_format, messag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.formats.cdr import DefinitionError
+from copem_replay.formats.json_messages import JsonDefinition
+from copem_replay.formats.protobuf import ProtobufDefinition
+from copem_replay.formats.raw_values import DefinitionError
 from copem_replay.formats.shred import (
     Definition,
     Level,
@@ -26,7 +28,6 @@ from copem_replay.formats.shred import (
     rows_above,
     take_apart,
 )
-from copem_replay.formats.tree import JsonDefinition, ProtobufDefinition
 from messages import SEPARATOR, defined, serialised, texts
 
 Kinds = descriptor_pb2.FieldDescriptorProto

@@ -25,7 +25,7 @@ from copem_replay.read import Recording, read
 from copem_replay.replay import Replay, believed, prepare, replay_block
 from copem_replay.results import write_results
 from copem_replay.run import run
-from copem_replay.tracks import CLASSES, VALUES
+from copem_replay.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES
 from copem_replay.unit_lists import read_listed
 from copem_replay.write import OSI_RECORD, RUN_RECORD, write_mcap
 from recordings import SHARED, Obj, ns, write_recording
@@ -342,13 +342,21 @@ def test_read_back_as_the_lists_of_a_unit(written: Written, configuration: str) 
     assert len(back.tracks.frame_ix) == len(rows) > 0
     np.testing.assert_allclose(back.tracks.arrives_s, fused.arrives_s, atol=1e-9)
     np.testing.assert_array_equal(back.tracks.frame_ix, fused.frame_ix[rows])
-    round_ = belief.class_of(scene)[rows] == CLASSES.index("pedestrian")
-    for name in (*VALUES, "cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
-        expected, found = getattr(fused, name)[0, rows], getattr(back.tracks, name)[0]
+    for name in (*VALUES, *UNCERTAINTIES):  # round ones have their length and width beside the list
+        column = getattr(fused, name)
+        expected = np.zeros(len(rows)) if column is None else np.nan_to_num(column[0, rows])
+        found = getattr(back.tracks, name)[0]
         if name == "yaw_rad":
             expected, found = np.cos(expected - found), np.ones(len(rows))
-        keep = ~round_ if name in ("length_m", "width_m") else np.ones(len(rows), dtype=bool)
-        np.testing.assert_allclose(found[keep], expected[keep], rtol=1e-9, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9, err_msg=name)
+    captured = fused.stamp_ns != NO_CAPTURE_NS
+    assert (fused.stamp_ns[captured] < scene.t0_ns + np.rint(fused.arrives_s[0, captured] * 1e9)).any() or (
+        configuration == "GT"
+    )
+    np.testing.assert_array_equal(back.tracks.stamp_ns[captured], fused.stamp_ns[captured])
+    np.testing.assert_array_equal(back.capture_said, captured)
+    if belief.said is not None:
+        np.testing.assert_array_equal(back.existence, belief.said["existence"][rows])
     assert back.class_probability.argmax(axis=1).tolist() == belief.class_of(scene)[rows].tolist()
 
 

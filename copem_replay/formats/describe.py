@@ -89,11 +89,38 @@ class Fields(Frozen):
 
 
 @dataclass(frozen=True)
+class Solid:
+    """Where an object says that it is a box, a sphere, a cylinder or a cone, and its sizes (shape_msgs)."""
+
+    kind: str
+    dimensions: str
+
+
+@dataclass(frozen=True)
+class Life:
+    """Where messages say that a thing of an earlier one is gone: paths from the message down, None: it is not said."""
+
+    id: str
+    stamp: tuple[str, ...] = ()
+    lifetime: tuple[str, ...] = ()
+    deletion: str | None = None
+    """What is deleted: `all`, or what has an id."""
+    deleted_id: str | None = None
+    all: tuple[str, ...] = ()
+
+    def paths(self) -> list[str]:
+        """All of them."""
+        return [p for p in (self.id, *self.stamp, *self.lifetime, self.deletion, self.deleted_id) if p is not None]
+
+
+@dataclass(frozen=True)
 class Description:
     """A format: its fields, which objects are meant (by values of `only`), and what an id is unique `within`.
 
     `said`: where an object says whether it says its `yaw`, `velocity`, `covariance`: a number, 0 where it does not.
-    `footprint`: the points of its outline, with x and y along its axes, where it has no length and width.
+    `footprint`: the points of its outline, with x and y along its axes, where it has no length and width. `solid`:
+    where its shape is said. `largest_of`: the list of things that may have several bodies; the largest counts. `life`:
+    where it is said how long things are there.
     """
 
     fields: Fields
@@ -101,3 +128,6 @@ class Description:
     within: str | None = None
     said: Mapping[Literal["yaw", "velocity", "covariance"], str] = field(default_factory=dict)
     footprint: str | None = None
+    solid: Solid | None = None
+    largest_of: str | None = None
+    life: Life | None = None

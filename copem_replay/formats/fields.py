@@ -6,11 +6,9 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from typing import Literal
 
 import numpy as np
@@ -18,6 +16,8 @@ import numpy as np
 from copem_replay.formats.classes import class_named
 from copem_replay.formats.columns import Columns
 from copem_replay.formats.describe import Amount, Class, Description, Fields, Stamp, Yaw
+from copem_replay.formats.life import life_notes
+from copem_replay.formats.shapes import largest, outlined, rounded
 from copem_replay.formats.shred import (
     Definition,
     Shredded,
@@ -25,22 +25,15 @@ from copem_replay.formats.shred import (
     any_item,
     common_level,
     level_of,
-    levels_to,
     rows_above,
     take_apart,
 )
-from copem_replay.tracks import CLASSES, VALUES, Bool, Float, Int
+from copem_replay.formats.stamps import nanoseconds
+from copem_replay.formats.wanted import FieldsError, Wanted
+from copem_replay.tracks import CLASSES, Bool, Float, Int
 from copem_replay.wording import counted
 
 __all__ = ["Class", "Description", "Fields", "FieldsError", "Listed", "Stamp", "Yaw", "listed"]
-
-_UNIT_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_PAIRS = (("sec", "nanosec"), ("seconds", "nanos"), ("sec", "nsec"), ("secs", "nsecs"))
-_LAST_SECOND = 4_000_000_000  # chosen: Unix time of 2096; differences of stamps still fit 64 bits
-_YAW = VALUES.index("yaw_rad")
-_SIZE = slice(VALUES.index("length_m"), VALUES.index("width_m") + 1)
-_COMPARED = 2000  # fields that are compared with one that is not there (chosen)
-_SHOWN = 12  # fields named in an error (chosen)
 
 
 @dataclass(frozen=True)
@@ -61,10 +54,6 @@ class Listed:
     named: bool  # whether its objects have ids
 
 
-class FieldsError(ValueError):
-    """A path that messages do not have: which key named it, and what there is instead."""
-
-
 def listed(definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int) -> Listed:
     """The lists that messages hold, logged at `log_time_ns (F,)`. Raises FieldsError."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is no number, or too large a one, is found out later
@@ -75,15 +64,12 @@ class _Reader:
     """Columns of one batch of messages."""
 
     def __init__(self, definition: Definition, description: Description, payloads: Sequence[bytes]) -> None:
-        self._fields, self._offers = description.fields, definition.offers()
+        self._fields = description.fields
         self._description = description
         self._notes: Counter[tuple[str, str]] = Counter()
-        objects = any_item(self._fields.objects)
-        lists = {level for path in self._offers for level in levels_to([path]) if level}
-        if objects not in lists or not self._fields.objects.endswith("[]"):
-            raise self._lacks("objects", self._fields.objects, "list", sorted(lists))
-        numbers, texts = self._wanted()
-        self._found: Shredded = take_apart(definition, payloads, numbers, texts)
+        self._wanted = Wanted(description, definition.offers())
+        self._found: Shredded = take_apart(definition, payloads, self._wanted.numbers, self._wanted.texts)
+        self._names = definition.names
         self._messages = len(payloads)
 
     def rows(self, level: str) -> int:
@@ -91,139 +77,33 @@ class _Reader:
 
     def number(self, path: str) -> Float:
         """(P,) of the objects: from their own level, or one above."""
-        whole = self._path(path)
+        whole = self._wanted.path(path)
         level = level_of(whole)
         column: Float = self._found.levels[level].numbers[whole]
         return column[rows_above(self._found, self._fields.objects, level)]
 
     def text(self, path: str) -> Texts:
-        whole = self._path(path)
+        whole = self._wanted.path(path)
         level = level_of(whole)
         found = self._found.levels[level].texts[whole]
         return Texts(found.code[rows_above(self._found, self._fields.objects, level)], found.words)
 
-    def _path(self, path: str) -> str:
-        return path[1:] if path.startswith("/") else f"{self._fields.objects}.{path}"
-
-    def _lacks(self, key: str, path: str, what: str = "", there: Collection[str] = ()) -> FieldsError:
-        offered = list(there or self._offers)
-        near = difflib.get_close_matches(path, offered[:_COMPARED], n=3, cutoff=0.5)
-        near += [p for p in offered if p.rpartition(".")[2] == path.rpartition(".")[2] and p not in near][:3]
-        shown = near or offered[:_SHOWN]
-        more = f", … ({len(offered)} in all)" if len(offered) > len(shown) else ""
-        what = f"{what} " if what else ""
-        return FieldsError(
-            f"read.{key}: the messages have no {what}{path!r}; they have {', '.join(shown) or 'nothing'}{more}"
-        )
-
-    def _need(self, key: str, path: str, within: str | None = None) -> str:
-        """The path. Raises FieldsError where messages do not have it, or several of it `within` one of a list."""
-        if any_item(path) not in self._offers:
-            raise self._lacks(key, path)
-        if within is not None and level_of(path) not in levels_to([within]):
-            level = level_of(path)
-            raise FieldsError(
-                f"read.{key}: {path!r} is several values for each of {level_of(within) or 'the message'}: "
-                f"choose one, {level.removesuffix('[]') + '[0]' + path[len(level) :]!r} say"
-            )
-        return path
-
-    def _of_object(self, key: str, path: str) -> str:
-        """The whole path, of which an object has one value. Raises FieldsError."""
-        return self._need(key, self._path(path), f"{self._fields.objects}.")
-
-    def _wanted(self) -> tuple[list[str], list[str]]:
-        fields, described = self._fields, self._description
-        numbers: list[str] = []
-        texts: list[str] = []
-        for key in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "existence"):
-            path = getattr(fields, key)
-            if isinstance(path, str):
-                numbers.append(self._of_object(key, path))
-        numbers += [self._of_object(key, path) for key, path in described.said.items()]
-        if described.footprint is not None:
-            numbers += [self._need("footprint", self._path(f"{described.footprint}.{axis}")) for axis in "xy"]
-        if isinstance(fields.yaw_rad, str):
-            numbers.append(self._of_object("yaw_rad", fields.yaw_rad))
-        elif isinstance(fields.yaw_rad, Yaw):
-            if fields.yaw_rad.degrees is not None:
-                numbers.append(self._of_object("yaw_rad.degrees", fields.yaw_rad.degrees))
-            elif fields.yaw_rad.quaternion is not None:
-                whole = fields.yaw_rad.quaternion
-                numbers += [self._of_object("yaw_rad.quaternion", f"{whole}.{axis}") for axis in "xyzw"]
-        if fields.covariance is not None:
-            numbers += [self._of_object("covariance", f"{fields.covariance}[{k}]") for k in (0, 1, 7)]
-        if fields.id is not None:
-            texts.append(self._of_object("id", fields.id))
-        if (said := self._class()) is not None:
-            whole = self._need("class", self._path(said.path))
-            texts.append(whole)
-            if said.probability is not None:
-                numbers.append(self._need("class.probability", self._path(said.probability), whole))
-            if said.key is not None:
-                texts.append(self._need("class.key", self._path(said.key), whole))
-        if fields.frame is not None:
-            texts.append(self._of_object("frame", f"/{fields.frame}"))
-        texts += [self._of_object("only", path) for path in described.only]
-        if described.within is not None:
-            texts.append(self._of_object("id", described.within))
-        texts += self._stamp_paths()
-        return numbers, texts
-
-    def _class(self) -> Class | None:
-        said = self._fields.class_
-        return Class(path=said) if isinstance(said, str) else said
-
-    def _stamp_paths(self) -> list[str]:
-        """Paths of the time stamp: of one number, or of seconds and nanoseconds."""
-        stamp = self._fields.stamp
-        if stamp is None:
-            return []
-        path = stamp.path if isinstance(stamp, Stamp) else stamp
-        found = stamps_in(self._offers, path)
-        if not found:
-            raise self._lacks("stamp", path)
-        return found
-
     def _stamps(self, log_time_ns: Int) -> tuple[Int, Bool]:
         """(F,) time stamps of all messages, and whether they say one."""
         stamp_ns, stamped = log_time_ns.copy(), np.zeros(len(log_time_ns), dtype=bool)
-        paths = self._stamp_paths()
+        paths, stamp = self._wanted.stamp, self._fields.stamp
         if not paths:
             return stamp_ns, stamped
-        stamp = self._fields.stamp
-        unit = stamp.unit if isinstance(stamp, Stamp) else "s"
         level = level_of(paths[0])
         found = self._found.levels[level]
         message = self._found.levels[""].parent[rows_above(self._found, level, "")]
-        parts = [
-            self._nanoseconds(found.texts[p], unit if len(paths) == 1 else u)
-            for p, u in zip(paths, ("s", "ns"), strict=False)
-        ]
-        seconds, said = parts[0]
-        if len(parts) == 2:
-            seconds, said = seconds + parts[1][0], said & parts[1][1]
+        unit = stamp.unit if isinstance(stamp, Stamp) else "s"
+        said_ns, said, impossible = nanoseconds([found.texts[p] for p in paths], unit)
+        if impossible:
+            self._notes["message", "with an impossible time stamp: the time of logging taken"] += impossible
         first = np.flatnonzero(said)[::-1]  # of several in one message the first
-        stamp_ns[message[first]], stamped[message[first]] = seconds[first], True
+        stamp_ns[message[first]], stamped[message[first]] = said_ns[first], True
         return stamp_ns, stamped
-
-    def _nanoseconds(self, texts: Texts, unit: str) -> tuple[Int, Bool]:
-        """Time in ns, exact for decimal numbers, and whether it is one that can be."""
-        of_word, good = np.zeros(len(texts.words) + 1, dtype=np.int64), np.zeros(len(texts.words) + 1, dtype=bool)
-        impossible = np.zeros(len(texts.words) + 1, dtype=bool)
-        for k, word in enumerate(texts.words):
-            try:
-                value = Decimal(word)
-            except ArithmeticError:  # no number
-                continue
-            if value.is_finite() and value.copy_abs() <= _LAST_SECOND * 1_000_000_000 // _UNIT_NS[unit]:
-                of_word[k], good[k] = round(value * _UNIT_NS[unit]), True
-            else:
-                impossible[k] = True
-        if impossible[texts.code].any():
-            what = "with an impossible time stamp: the time of logging taken"
-            self._notes["message", what] += int(impossible[texts.code].sum())
-        return of_word[texts.code], good[texts.code]
 
     def _amount(self, amount: Amount | None, otherwise: float) -> Float:
         if isinstance(amount, str):
@@ -246,25 +126,28 @@ class _Reader:
     def _classes(self) -> Float:
         """(P, C) probability of each class, sums to 1."""
         rows = self.rows(self._fields.objects)
-        said = self._class()
+        said = self._wanted.class_
         probability = np.zeros((rows, len(CLASSES)))
         if said is not None:
-            whole = self._path(said.path)
+            whole = self._wanted.path(said.path)
             level = level_of(whole)
             shared = common_level(level, self._fields.objects)
             texts = self._found.levels[level].texts[whole]
-            of_word = np.array([_class_ix(word, said.map) for word in texts.words] + [-1])
+            known_as = self._by_name(any_item(whole), said.map)
+            of_word = np.array([_class_ix(word, known_as) for word in texts.words] + [-1])
             code = of_word[texts.code]
             share = np.ones(len(code))
             if said.probability is not None:
-                share = self._found.levels[level_of(self._path(said.probability))].numbers[self._path(said.probability)]
-                share = share[rows_above(self._found, level, level_of(self._path(said.probability)))]
+                share = self._found.levels[level_of(self._wanted.path(said.probability))].numbers[
+                    self._wanted.path(said.probability)
+                ]
+                share = share[rows_above(self._found, level, level_of(self._wanted.path(said.probability)))]
                 # said with no probability it is still said; more than certain is nothing
                 share = np.clip(np.nan_to_num(share), 1e-9, 1.0)
             known = code >= 0
             if said.key is not None:
-                keys = self._found.levels[level_of(self._path(said.key))].texts[self._path(said.key)]
-                key = keys.code[rows_above(self._found, level, level_of(self._path(said.key)))]
+                keys = self._found.levels[level_of(self._wanted.path(said.key))].texts[self._wanted.path(said.key)]
+                key = keys.code[rows_above(self._found, level, level_of(self._wanted.path(said.key)))]
                 known &= np.array([word.lower() in said.keys for word in keys.words] + [False])[key]
             owner = rows_above(self._found, level, shared)
             claimed = np.zeros((self.rows(shared), len(CLASSES)))
@@ -274,6 +157,11 @@ class _Reader:
         probability[none, CLASSES.index("other")] = 1.0
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
+
+    def _by_name(self, path: str, meant: Mapping[str, str]) -> Mapping[str, str]:
+        """What values mean, those of an enumeration by their names, too."""
+        names = {name: meant[str(number)] for number, name in self._names(path).items() if str(number) in meant}
+        return {**names, **meant}
 
     def _frame_of(self) -> tuple[Int, tuple[str, ...]]:
         path = self._fields.frame
@@ -315,25 +203,19 @@ class _Reader:
         said: Bool = self.number(path) != 0
         return said
 
-    def _outlined(self, values: Float) -> None:
-        """Give those without length and width the box around their footprint."""
-        footprint = self._description.footprint
-        if footprint is None:
-            return
-        level = level_of(self._path(f"{footprint}.x"))
-        points = self._found.levels[level]
-        owner = rows_above(self._found, level, self._fields.objects)
-        least, most = (np.full((len(values), 2), end) for end in (np.inf, -np.inf))
-        for k, axis in enumerate("xy"):
-            along = points.numbers[self._path(f"{footprint}.{axis}")]
-            np.minimum.at(least[:, k], owner, along)
-            np.maximum.at(most[:, k], owner, along)
-        size = values[:, _SIZE]
-        flat = np.flatnonzero(~(size > 0).all(axis=1) & (most > least).all(axis=1))  # of no point: never
-        middle, yaw = (least[flat] + most[flat]) / 2, values[flat, _YAW]
-        values[flat, _SIZE] = most[flat] - least[flat]
-        values[flat, 0] += middle[:, 0] * np.cos(yaw) - middle[:, 1] * np.sin(yaw)
-        values[flat, 1] += middle[:, 0] * np.sin(yaw) + middle[:, 1] * np.cos(yaw)
+    def _shaped(self, values: Float, meant: Bool) -> Bool:
+        """Give all the boxes that their shapes say; (P,) which are meant all the same."""
+        described, objects = self._description, self._fields.objects
+        if described.footprint is not None:
+            outlined(values, self._found, objects, self._wanted.path(described.footprint))
+        if (solid := described.solid) is not None:
+            rounded(values, *(self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2)))))
+        if described.largest_of is None:
+            return meant
+        chosen = largest(values, meant, self._found, objects, described.largest_of)
+        if beside := int((meant & ~chosen).sum()):
+            self._notes["cube", "beside a larger one of the same entity: left out"] += beside
+        return chosen
 
     def listed(self, log_time_ns: Int) -> Listed:
         """All columns."""
@@ -361,7 +243,7 @@ class _Reader:
             ],
             axis=1,
         )
-        self._outlined(values)
+        taken = self._shaped(values, taken)
         message = found.levels[""].parent[rows_above(found, fields.objects, "")]
         ids = self._ids()
         nameless = np.zeros(len(taken), dtype=bool) if ids is None else (ids.code < 0) & taken
@@ -386,7 +268,14 @@ class _Reader:
             object_ix=number.astype(np.int64),
             class_ix=probability[keep].argmax(axis=1).astype(np.int8),
             values=values[keep],
-            notes=tuple(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()),
+            notes=(
+                *(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()),
+                *(
+                    ()
+                    if self._description.life is None
+                    else life_notes(found, self._description.life, stamp_ns, stamped)
+                ),
+            ),
         )
         frame, frames = self._frame_of()
         covariance = np.full((len(keep), 3), np.nan)
@@ -403,14 +292,6 @@ class _Reader:
             log_time_ns[kept_message],
             ids is not None,
         )
-
-
-def stamps_in(offers: Collection[str], path: str) -> list[str]:
-    """Paths of the time stamp at `path`: of one number, or of seconds and nanoseconds; none: there is none."""
-    if any_item(path) in offers:
-        return [path]
-    pairs = ([f"{path}.{name}" for name in pair] for pair in _PAIRS)
-    return next((both for both in pairs if all(any_item(p) in offers for p in both)), [])
 
 
 def _joined(spaces: Texts, space: int, ids: Texts, ident: int) -> str:

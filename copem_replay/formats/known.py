@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from mcap.records import Schema
 
 from copem_replay.container import Channel
 from copem_replay.formats import ros2_lists, scene_update
-from copem_replay.formats.cdr import CdrDefinition, DefinitionError
+from copem_replay.formats.cdr import CdrDefinition
 from copem_replay.formats.fields import Description
+from copem_replay.formats.json_messages import JsonDefinition
+from copem_replay.formats.protobuf import ProtobufDefinition
+from copem_replay.formats.raw_values import DefinitionError
 from copem_replay.formats.shred import Definition
-from copem_replay.formats.tree import JsonDefinition, ProtobufDefinition
 
 _ENCODINGS = ("cdr", "protobuf", "json")
 LISTS = (*ros2_lists.DESCRIPTIONS, *scene_update.SCHEMAS)
@@ -35,7 +37,7 @@ def names_objects(channel: Channel) -> bool:
     return is_list(channel) and not schema_name(channel).endswith("/DetectedObjects")
 
 
-def definition_of(channel: Channel, samples: Iterable[bytes]) -> Definition:
+def definition_of(channel: Channel, samples: Sequence[bytes]) -> Definition:
     """How messages of the channel are taken apart; `samples` where only they tell. Raises DefinitionError."""
     if channel.encoding == "cdr":
         return CdrDefinition(channel.schema, channel.schema_encoding, channel.schema_data)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.container import Channel
-from copem_replay.formats.fields import stamps_in
 from copem_replay.formats.known import definition_of, schema_name
 from copem_replay.formats.shred import level_of, take_apart
+from copem_replay.formats.stamps import stamps_in
 from copem_replay.tracks import Float, Int
 
 _FARTHEST_M = 1e9  # a coordinate beyond is no position (chosen: far more than the earth is wide)

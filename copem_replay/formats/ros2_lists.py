@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import Literal
 
-from copem_replay.formats.fields import Class, Description, Fields, Yaw
+from copem_replay.formats.describe import Class, Description, Fields, Solid, Yaw
 
 # ObjectClassification.msg of both packages; from HAZARD on it is no road user
 _AUTOWARE = {
@@ -135,7 +135,8 @@ def _derived(offers: Collection[str]) -> Description:
                 "vx_mps": "twist.linear.x",
                 "vy_mps": "twist.linear.y",
             }
-        )
+        ),
+        solid=Solid("shape.type", "shape.dimensions") if "objects[].shape.type" in offers else None,
     )
 
 

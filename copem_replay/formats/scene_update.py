@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from copem_replay.formats.fields import Class, Description, Fields, Yaw
+from copem_replay.formats.describe import Class, Description, Fields, Life, Yaw
+from copem_replay.formats.stamps import stamps_in
 
 SCHEMAS = ("foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate")
 _KEYS = ("class", "category", "category_name", "classification", "label", "object_class", "type")
@@ -34,5 +35,19 @@ def description(offers: Collection[str]) -> Description:
                 "width_m": "size.y",
                 "height_m": "size.z",
             }
-        )
+        ),
+        largest_of="entities[]",
+        life=_life(offers) if "entities[].id" in offers else None,
+    )
+
+
+def _life(offers: Collection[str]) -> Life:
+    """An entity stays until one of its id replaces it, it is deleted, or its lifetime, if it has one, is over."""
+    return Life(
+        "entities[].id",
+        tuple(stamps_in(offers, "entities[].timestamp")),
+        tuple(stamps_in(offers, "entities[].lifetime")),
+        "deletions[].type" if "deletions[].type" in offers else None,
+        "deletions[].id" if "deletions[].id" in offers else None,
+        ("ALL", "1"),
     )

@@ -9,7 +9,7 @@ whoever reads a format works on columns, whatever the messages were encoded in.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -49,6 +49,10 @@ class Definition(Protocol):
 
     def offers(self) -> dict[str, str]:
         """The paths of all leaves, and what each is: `number`, `text`."""
+        ...
+
+    def names(self, path: str) -> Mapping[int, str]:
+        """The names of the numbers of an enumeration, empty for what is none."""
         ...
 
     def picks(self, path: str) -> bool:
@@ -92,6 +96,23 @@ def take_apart(
             rows, to = rows[to >= 0], to[to >= 0]
         levels[level] = _with_items(levels[level], levels[source], path, to, rows)
     return Shredded(levels, found.decoded)
+
+
+BATCH_BYTES = 4_000_000
+"""Of messages taken apart at once: what a cache holds (chosen)."""
+
+
+def batches(payloads: Sequence[bytes], most_bytes: int | None = None) -> Iterator[slice]:
+    """Messages in runs of some megabytes, or of about `most_bytes`."""
+    most_bytes = BATCH_BYTES if most_bytes is None else most_bytes
+    first, size = 0, 0
+    for k, payload in enumerate(payloads):
+        size += len(payload)
+        if size > most_bytes:
+            yield slice(first, k + 1)
+            first, size = k + 1, 0
+    if first < len(payloads):
+        yield slice(first, len(payloads))
 
 
 _ITEM = re.compile(r"\[(\d{1,9})\]")
