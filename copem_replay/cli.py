@@ -50,7 +50,7 @@ def version(
 
 @app.command()
 def info(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Recordings (MCAP).")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Recordings: MCAP, rosbag2 folder, .osi.")],
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, one array.")] = False,
 ) -> int:
     """What is in a recording: topics, object lists, objects, span, rate, ego vehicle, what is missing.
@@ -71,7 +71,7 @@ def info(
 
 
 @app.command()
-def init(log: Annotated[Path, typer.Argument(metavar="LOG", help="Recording (MCAP).")]) -> int:
+def init(log: Annotated[Path, typer.Argument(metavar="LOG", help="Recording: MCAP, rosbag2 folder, .osi.")]) -> int:
     """Print an experiment that replays a recording, with comments: copem-replay init LOG > experiment.yaml.
 
     Its paths are relative to where you are. Ends 2 when no list of true objects could be read.

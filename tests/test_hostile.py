@@ -208,7 +208,7 @@ def test_names_cannot_break_a_line(path):
     sample.channels[0].topic = b"a\nb\x1b[31m"
     sample.schemas[0].name = b"some\nthing"
     written(path, whole(sample))
-    assert line(path).endswith(r"the file holds some\nthing (json) on a\nb\x1b[31m")
+    assert r"; it holds some\nthing (json) on a\nb\x1b[31m; " in line(path)
 
 
 def test_errors_are_lines():
