@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -16,6 +17,9 @@ METADATA = "metadata.yaml"
 _INFORMATION = "rosbag2_bagfile_information"
 _LONGEST_BYTES = 1 << 19
 """A longer description is none (chosen: three hundred topics and a thousand files take half of it)."""
+
+_DEEPEST = 100  # brackets within brackets (chosen: rosbag2 writes none)
+_BRACKET = re.compile(rb"[\[\]{}]")
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -55,6 +59,8 @@ def _information(folder: Path) -> Node:
         raise RecordingError(f"{place}: cannot be opened: {error.strerror}") from None
     if len(content) > _LONGEST_BYTES:
         raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found more than 512 KiB")
+    if _depth(content) > _DEEPEST:
+        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found brackets nested too deeply")
     try:
         root = composed(content.decode())
     except UnicodeDecodeError:
@@ -65,6 +71,15 @@ def _information(folder: Path) -> Node:
     if not isinstance(information, MappingNode):
         raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found no `{_INFORMATION}`")
     return information
+
+
+def _depth(content: bytes) -> int:
+    """How many brackets are open at most: what the YAML library reads takes time with the square of them."""
+    deepest = depth = 0
+    for found in _BRACKET.finditer(content):
+        depth += 1 if found[0] in b"[{" else -1
+        deepest = max(deepest, depth)
+    return deepest
 
 
 def _names(information: Node) -> list[str]:
