@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from copem_replay.container import name_of
 from copem_replay.errors import RecordingError
 from copem_replay.experiment import Carriers, Experiment, ReadFields
 from copem_replay.experiment_file import Source, is_there, log_paths, parse
@@ -45,13 +46,15 @@ def _line_number(problem: str, path: Path) -> int:
 
 def place_of(path: Path) -> Path:
     """Where a file is, whatever led there; its own name is kept, even if it is a link's."""
+    if path.name in ("", ".."):  # folders that are named by where we are
+        return Path(os.path.realpath(path))
     return Path(os.path.realpath(path.parent)) / path.name
 
 
 def log_names(paths: Sequence[Path]) -> list[str]:
-    """A name per log: its file name, made unique by its folder where two are alike."""
+    """A name per log: the name of its file or folder, made unique by its folder where two are alike."""
     whole = [place_of(path).relative_to("/") for path in paths]
-    bare = [path.with_suffix("") for path in whole]
+    bare = [path.parent / name_of(Path("/", path)) for path in whole]
     bare = [short if bare.count(short) == 1 else path for short, path in zip(bare, whole, strict=True)]
     depth = [1] * len(paths)
     while True:
@@ -95,7 +98,7 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
     fields = experiment.read if isinstance(experiment.read, ReadFields) else None
     beside = {asked.topic for asked in experiment.recorded.values()}
     try:
-        recording = read(path, name=path.stem, ego=ego, topic=experiment.read.topic, fields=fields, beside=beside)
+        recording = read(path, name=name_of(path), ego=ego, topic=experiment.read.topic, fields=fields, beside=beside)
     except RecordingError as error:
         reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
         if not reasons[0].startswith("ego: "):
@@ -103,7 +106,7 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
             return None, [Refused(path, reason, key) for reason in reasons]
         wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
         recording = read(
-            path, name=path.stem, topic=experiment.read.topic, fields=fields, beside=beside
+            path, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside
         )  # for what else is wrong
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))

@@ -1,14 +1,15 @@
-"""The MCAP container: its channels, the payloads of some of them, what can be saved of a damaged file.
+"""The containers of recordings: their channels, the payloads of some of them, what can be saved of a damaged file.
 
-A file with a sound index is read through it. Everything else (no index, an index that lies, a file that was
-cut off, a checksum that fails) is read from start to end, as far as it goes.
+Here it is MCAP; folders of rosbag2 are in `bag.py`, OSI's traces of a single channel in `trace.py`. An MCAP file with a
+sound index is read through it. Everything else (no index, an index that lies, a file that was cut off, a checksum that
+fails) is read from start to end, as far as it goes.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -22,9 +23,8 @@ from mcap.summary import Summary
 from copem_replay.chunks import DAMAGE, MAGIC, without_trace
 from copem_replay.errors import RecordingError
 from copem_replay.indexed import in_order, summary_of
+from copem_replay.not_mcap import check_magic
 from copem_replay.salvage import FromStart
-
-_LFS_POINTER = b"version https://git-lfs"
 
 
 @dataclass(frozen=True)
@@ -42,15 +42,19 @@ class Channel:
 
 
 class BrokenIndexError(Exception):
-    """An index that seemed sound is not, or what it points at is damaged: `from_start` is the way."""
+    """An index that seemed sound is not, or what it points at is damaged: `Log.from_start` is the way."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: the index cannot be used")
+        self.path = path
 
 
 @dataclass(frozen=True)
 class Log:
-    """An MCAP file that was looked at.
+    """A recording that was looked at: an MCAP file; other containers do the same in their own way.
 
     `damage` says what is wrong with the file, None where nothing is; `complete` whether all messages can be
-    read all the same.
+    read all the same. `notes`: what else is to be said of the container.
     """
 
     path: Path
@@ -59,18 +63,29 @@ class Log:
     damage: str | None = None
     complete: bool = True
     went_on: bool = False  # whether messages after the damage were read
+    start_ns: int = 0  # log time of the first message
+    notes: tuple[str, ...] = ()
 
     def payloads(self, numbers: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Messages of some channels: channel number, log time in ns, payload.
+        """Messages of some channels: channel number, log time in ns, payload. As `messages`."""
+        for message in self.messages(numbers):
+            yield message.channel_id, message.log_time, message.data
 
-        By log time through the index, else as in the file, up to the damage. Raises BrokenIndexError.
+    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+        """Messages of some channels: by log time through the index, else as in the file, up to the damage.
+
+        Raises BrokenIndexError.
         """
         with open_file(self.path) as file:
             for message in self._by_index(file, numbers) if self.indexed else FromStart(file):
                 if isinstance(message, Message) and message.channel_id in numbers:
-                    yield message.channel_id, message.log_time, message.data
+                    yield message
 
-    def _by_index(self, file: IO[bytes], numbers: frozenset[int]) -> Iterator[Message]:
+    def from_start(self, error: BrokenIndexError) -> Log:
+        """The same recording, read without the index that turned out to be broken. Raises RecordingError."""
+        return from_start(self.path, error.__cause__, self.channels)
+
+    def _by_index(self, file: IO[bytes], numbers: Set[int]) -> Iterator[Message]:
         """Messages in order of log time. Raises BrokenIndexError, also where there are not as many as promised."""
         promised = sum(c.messages for c in self.channels if c.number in numbers)
         found = 0
@@ -84,7 +99,7 @@ class Log:
             if found != promised:
                 raise ValueError(f"the index promises {promised} messages, and there are {found}")
         except DAMAGE as error:
-            raise BrokenIndexError from without_trace(error)
+            raise BrokenIndexError(self.path) from without_trace(error)
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -96,17 +111,44 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def open_log(path: Path) -> Log:
-    """Look at an MCAP file. Raises RecordingError where it is none, or nothing in it can be read."""
+    """Look at a recording. Raises RecordingError where it is none, or nothing in it can be read."""
+    if path.is_dir():
+        from copem_replay.bag import open_bag
+
+        return open_bag(path)
+    if is_trace(path):
+        from copem_replay.trace import open_trace
+
+        return open_trace(path)
+    return open_mcap(path)
+
+
+def is_trace(path: Path) -> bool:
+    """Whether a file is to be read as OSI's trace of a single channel: by its name, unless it is MCAP all the same."""
+    if path.suffix.lower() != ".osi" or not path.is_file():
+        return False
+    with open_file(path) as file:
+        return file.read(len(MAGIC)) != MAGIC
+
+
+def name_of(path: Path) -> str:
+    """What a log is called: a file without its suffix, a folder as it is."""
+    return path.name if path.is_dir() else path.stem
+
+
+def open_mcap(path: Path) -> Log:
+    """Look at an MCAP file. Raises RecordingError."""
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
     if not path.is_file():
         raise RecordingError(f"{path}: expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}")
     with open_file(path) as file:
-        _check_magic(path, file)
+        check_magic(path, file)
         try:
             summary = summary_of(file)
             if summary is not None and _index_is_sound(summary):
-                return Log(path, _channels_of(summary), indexed=True)
+                start_ns = min((c.message_start_time for c in summary.chunk_indexes), default=0)
+                return Log(path, _channels_of(summary), indexed=True, start_ns=start_ns)
         except DAMAGE as error:
             return from_start(path, error)
     return from_start(path)
@@ -119,23 +161,37 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
     is damage and no message before it.
     """
     counts: Counter[int] = Counter()
+    start_ns = 1 << 64
     with open_file(path) as file:
         stream = FromStart(file)
         for record in stream:
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
+                start_ns = min(start_ns, record.log_time)
     expected = {c.number: c.messages for c in promised}
     channels = tuple(
         _channel(number, channel, stream.schemas.get(channel.schema_id), counts[number], expected.get(number))
         for number, channel in sorted(stream.channels.items())
     )
     error = stream.error or index_error
+    if error is None and promised and sum(expected.values()) != sum(counts.values()):
+        error = ValueError(
+            f"the index promises {sum(expected.values())} messages, and there are {sum(counts.values())}"
+        )
     damage = _reason(error) if error else None
     if damage and not sum(counts.values()):
         raise RecordingError(f"{path}: damaged, and no message can be read ({damage})")
     if damage and stream.complete:
         damage = f"its index cannot be used ({damage}): read from start to end, no message is lost"
-    return Log(path, channels, indexed=False, damage=damage, complete=stream.complete, went_on=stream.went_on)
+    return Log(
+        path,
+        channels,
+        indexed=False,
+        damage=damage,
+        complete=stream.complete,
+        went_on=stream.went_on,
+        start_ns=start_ns,
+    )
 
 
 def _reason(error: BaseException) -> str:
@@ -147,17 +203,6 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, zstandard.ZstdError | RuntimeError):
         return f"a chunk cannot be decompressed: {error}"
     return f"{error}" if str(error) and not isinstance(error, KeyError) else f"{type(error).__name__} {error}".strip()
-
-
-def _check_magic(path: Path, file: IO[bytes]) -> None:
-    start = file.read(64)
-    if not start:
-        raise RecordingError(f"{path}: the file is empty")
-    if start.startswith(_LFS_POINTER):
-        raise RecordingError(f"{path}: a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)")
-    if not start.startswith(MAGIC):
-        raise RecordingError(f"{path}: expected an MCAP file, found one that starts with {start[:16]!r}")
-    file.seek(0)
 
 
 def _index_is_sound(summary: Summary) -> bool:

@@ -11,10 +11,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from copem_replay.formats.poses import Poses
 from copem_replay.repair import MAX_GAP_S
+from copem_replay.rotation import back, combined, turned
 from copem_replay.tracks import Bool, Float, Int
 
 
@@ -50,11 +50,11 @@ class Course:
         there = (share[:, 0] >= 0) & (share[:, 0] <= 1) & ((apart <= MAX_GAP_S * 1e9) | exact)
         a, b = self.rotation[before], self.rotation[after]
         b = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
-        turned = (1 - share) * a + share * b  # samples are near each other: on the short arc this is the rotation
+        mixed = (1 - share) * a + share * b  # samples are near each other: on the short arc this is the rotation
         return Placed(
             there,
             (1 - share) * self.position_m[before] + share * self.position_m[after],
-            turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12),
+            mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12),
         )
 
 
@@ -107,11 +107,11 @@ class Frames:
         if common is None:
             return None
         here, there = (self._climb(chain[: chain.index(common)], stamp_ns) for chain in (up, down))
-        turned = Rotation.from_quat(there.rotation).inv()
+        turn = back(there.rotation)
         return Placed(
             here.there & there.there,
-            turned.apply(here.position_m - there.position_m),
-            (turned * Rotation.from_quat(here.rotation)).as_quat(),
+            turned(turn, here.position_m - there.position_m),
+            combined(turn, here.rotation),
         )
 
     def _climb(self, steps: Iterable[str], stamp_ns: Int) -> Placed:
@@ -120,18 +120,10 @@ class Frames:
         position, rotation = np.zeros((len(stamp_ns), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(stamp_ns), 1))
         for name in steps:
             step = self.courses[name].at(stamp_ns, forever=self._stands(name))
-            turn = Rotation.from_quat(step.rotation)
-            position = turn.apply(position) + step.position_m
-            rotation = (turn * Rotation.from_quat(rotation)).as_quat()
+            position = turned(step.rotation, position) + step.position_m
+            rotation = combined(step.rotation, rotation)
             known &= step.there
         return Placed(known, position, rotation)
 
     def _stands(self, child: str) -> bool:
         return child in self.static or len(self.courses[child].stamp_ns) == 1
-
-
-def yaw_of(rotation: Float) -> Float:
-    """(K,) headings of quaternions (K, 4)."""
-    x, y, z, w = rotation.T
-    yaw: Float = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return yaw

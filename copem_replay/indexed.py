@@ -6,7 +6,7 @@ import heapq
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Mapping, Set
 from io import BytesIO
 from typing import IO
 
@@ -105,3 +105,8 @@ def in_order(file: IO[bytes], summary: Summary, numbers: Set[int]) -> Iterator[M
                 if held > _HELD_LIMIT_BYTES:
                     raise ValueError("its chunks overlap in time")
                 heapq.heappush(waiting, (record.log_time, offset, place, record))
+
+
+def renumbered(message: Message, numbers: Mapping[int, int]) -> Message:
+    """The same message on another channel."""
+    return Message(numbers[message.channel_id], message.log_time, message.data, message.publish_time, message.sequence)

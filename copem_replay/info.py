@@ -42,7 +42,12 @@ def survey(path: Path | str) -> dict[str, Any]:
     choice to make (then `choice` says so). `proposals`: where no list is known by name, what could be read by naming
     fields. A bad recording raises nothing.
     """
-    found: dict[str, Any] = {"recording": Path(path).name, "readable": False, "reason": None, "choice": None}
+    found: dict[str, Any] = {
+        "recording": Path(path).name or str(path),
+        "readable": False,
+        "reason": None,
+        "choice": None,
+    }
     # damage: of the file, what is wrong with it
     found |= {"damage": None, "topics": [], "truth": [], "log": str(path), "experiment": None}
     found["proposals"] = []
@@ -62,7 +67,7 @@ def survey(path: Path | str) -> dict[str, Any]:
     beside = [t["topic"] for t in found["topics"] if t["role"] == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=Path(path).stem, topic=topic, beside=beside)
+            recording = read_log(log, name=container.name_of(Path(path)), topic=topic, beside=beside)
         except RecordingError as error:
             failures.append(str(error))
             continue

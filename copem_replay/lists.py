@@ -112,7 +112,7 @@ def _all_rows(path: Path, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]
     try:
         return _read(log, topic)
     except container.BrokenIndexError as error:
-        return _read(container.from_start(path, error.__cause__, log.channels), topic)
+        return _read(log.from_start(error), topic)
 
 
 def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""The original recording on its way into the output: every channel, message, metadata record and attachment as it was.
+"""An MCAP file on its way into the output: every channel, message, metadata record and attachment as it was.
 
 A sound file comes in order of log time through its index; a damaged one is read from its start as far as it goes, and
 sorted.
@@ -6,16 +6,15 @@ sorted.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import Writer
 
 from copem_replay.chunks import DAMAGE, MAGIC, parsed, record_at
-from copem_replay.container import open_file, open_log
-from copem_replay.indexed import in_order, summary_of
+from copem_replay.container import Log, open_file
+from copem_replay.indexed import in_order, renumbered, summary_of
 from copem_replay.salvage import FromStart
 
 
@@ -26,6 +25,7 @@ class Catalogue:
         self.writer = writer
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[object, ...], int] = {}
+        self._attached: set[tuple[object, ...]] = set()
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """The number of a schema."""
@@ -41,24 +41,31 @@ class Catalogue:
             self._channels[key] = self.writer.register_channel(topic, encoding, schema, ordered)
         return self._channels[key]
 
+    def attach(self, a: Attachment) -> None:
+        """An attachment."""
+        key = (a.create_time, a.log_time, a.name, a.media_type, a.data)
+        if key not in self._attached:
+            self._attached.add(key)
+            self.writer.add_attachment(*key)
+
 
 class Original:
-    """What is in a recording besides its messages, and its messages on demand.
+    """What is in a file besides its messages, and its messages on demand.
 
-    `damage` says that not all of it can be copied, None where all can. Raises RecordingError where nothing can be read.
+    `damage` says that not all of it can be copied, None where all can.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, log: Log) -> None:
+        self._path = log.path
         self.damage: str | None = None
         self.profile = ""
         self.metadata: dict[str, dict[str, str]] = {}
         self.channels: dict[int, Channel] = {}
+        self.attachments: list[Attachment] = []
+        self.start_ns = log.start_ns
         self._schemas: dict[int, Schema] = {}
-        self._attachments: list[Attachment] = []
-        self._salvaged: list[Message] | None = None
-        log = open_log(path)
-        if not log.indexed or not self._look_up():
+        self._by_index = log.indexed and self._look_up()
+        if not self._by_index:
             self._salvage()
             if not log.complete or log.indexed:
                 self.damage = "damaged: its messages are copied as far as they can be read"
@@ -88,12 +95,11 @@ class Original:
         for record in metadata:  # rosbag2 writes one name several times
             if isinstance(record, Metadata):
                 self.metadata.setdefault(record.name, {}).update(record.metadata)
-        self._attachments = [record for record in attachments if isinstance(record, Attachment)]
+        self.attachments = [record for record in attachments if isinstance(record, Attachment)]
         self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
         return True
 
     def _salvage(self) -> None:
-        self._salvaged, self._attachments = [], []
         with open_file(self._path) as file:
             stream = FromStart(file)
             for record in stream:
@@ -102,11 +108,8 @@ class Original:
                 elif isinstance(record, Metadata):
                     self.metadata.setdefault(record.name, dict(record.metadata))
                 elif isinstance(record, Attachment):
-                    self._attachments.append(record)
-                elif isinstance(record, Message):
-                    self._salvaged.append(record)
+                    self.attachments.append(record)
         self._schemas, self.channels = stream.schemas, stream.channels
-        self._salvaged.sort(key=lambda m: m.log_time)
 
     def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
         """Schemas, channels and attachments put into the output. Returns the new number of each channel.
@@ -122,20 +125,17 @@ class Original:
             numbers[number] = catalogue.channel(
                 channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
             )
-        for a in self._attachments:
-            catalogue.writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+        for attachment in self.attachments:
+            catalogue.attach(attachment)
         return numbers
 
-    def messages(self, numbers: dict[int, int]) -> Iterator[Message]:
+    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
         """All messages in order of log time, with the channel numbers of the output."""
-        if self._salvaged is not None:
-            yield from (_moved(m, numbers) for m in self._salvaged if m.channel_id in numbers)
-            return
         with open_file(self._path) as file:
-            summary = summary_of(file)
-            for message in in_order(file, summary, numbers.keys()) if summary is not None else ():
-                yield _moved(message, numbers)
-
-
-def _moved(message: Message, numbers: dict[int, int]) -> Message:
-    return Message(numbers[message.channel_id], message.log_time, message.data, message.publish_time, message.sequence)
+            if self._by_index and (summary := summary_of(file)) is not None:
+                found = in_order(file, summary, numbers.keys())
+            else:
+                there = (r for r in FromStart(file) if isinstance(r, Message) and r.channel_id in numbers)
+                found = iter(sorted(there, key=lambda message: message.log_time))
+            for message in found:
+                yield renumbered(message, numbers)

@@ -32,14 +32,14 @@ def read(text: str) -> tuple[Any, dict[Key, int], list[tuple[Key, int, str]]]:
 
     Raises NotYamlError.
     """
-    root = _composed(text)
+    root = composed(text)
     if root is None:
         return None, {(): 1}, []
     reading = _Reading()
     return reading.plain(root, ()), reading.lines, reading.problems
 
 
-def _composed(text: str) -> Node | None:
+def composed(text: str) -> Node | None:
     """The nodes of a text, None where it is empty. Raises NotYamlError."""
     line, why = 1, ""
     try:

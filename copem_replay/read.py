@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not
     from copem_replay.lists import RecordedLists
     from copem_replay.topics import Surroundings
 
-_SHOWN = 12  # ids named in an error (chosen)
+_SHOWN = 12  # ids or topics named in an error (chosen)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def read_log(
     try:
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     except container.BrokenIndexError as error:
-        log = container.from_start(log.path, error.__cause__, log.channels)
+        log = log.from_start(error)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     scene, truth, found = assemble(columns, name)
     notes = [*columns.notes, *found]
@@ -100,7 +100,7 @@ def read_log(
     host, said = _host(columns.hosts)
     ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _damage(log, topic, scene.end_s)
-    notes = [*([damage] if damage else []), *ignored, *notes, *said, *more]
+    notes = [*([damage] if damage else []), *log.notes, *ignored, *notes, *said, *more]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized)
     said_all = tuple(printable(note) for note in notes)
@@ -154,12 +154,9 @@ def choose_topic(
             raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; messages are on {_named(topics)}")
         return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
     if not topics:
-        from copem_replay.formats.known import LISTS
-
         raise RecordingError(
-            f"{log.path}: no list of true objects; known by name are {', '.join((*osi.TRUTH_SCHEMAS, *LISTS))}; any "
-            "other can be read by naming its fields (`read: {topic: …, objects: …}`); the file holds "
-            f"{_listed(log.channels)}"
+            f"{log.path}: no list of true objects; it holds {_listed(log.channels)}; "
+            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
         )
     if topic is not None and topic not in topics:
         raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; they are on {_named(topics)}")
@@ -300,7 +297,9 @@ def _named(topics: dict[str, str]) -> str:
 
 def _listed(channels: Sequence[Channel]) -> str:
     """Schemas and topics of a file, for an error."""
-    return ", ".join(
+    names = [
         f"{c.schema or 'no schema'}{'' if c.encoding == 'protobuf' else f' ({c.encoding})'} on {c.topic}"
         for c in channels
-    )
+    ]
+    more = f", … ({counted(len(names), 'topic')} in all)" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

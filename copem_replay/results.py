@@ -21,6 +21,7 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.accuracy_tables import AccuracyTables
+from copem_replay.bag_metadata import files_of
 from copem_replay.check import place_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
@@ -219,8 +220,12 @@ def write_csv(table: pd.DataFrame, path: Path) -> None:
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Of a file; of a folder of rosbag2, of its files one after the other, as `cat` has them."""
+    digest = hashlib.sha256()
+    for place in files_of(path) if path.is_dir() else [path]:
+        with place.open("rb") as file:
+            hashlib.file_digest(file, lambda: digest)
+    return digest.hexdigest()
 
 
 def _umask() -> int:

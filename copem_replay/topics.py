@@ -8,21 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from copem_replay.container import Channel, Log
 from copem_replay.errors import RecordingError
-from copem_replay.experiment import EgoTopic
 from copem_replay.formats.columns import LAST_NS, Columns
 from copem_replay.formats.fields import Description, Fields, FieldsError, Listed, listed
 from copem_replay.formats.known import definition_of, description_of, is_list, schema_name
 from copem_replay.formats.poses import ODOMETRY, Poses, is_pose, poses_of
 from copem_replay.formats.raw_values import DefinitionError
-from copem_replay.frames import Course, Frames, course_of, yaw_of
+from copem_replay.frames import Course, Frames, course_of
+from copem_replay.rotation import turned, yaw_of
 from copem_replay.tracks import CLASSES, VALUES, Float
 from copem_replay.wording import counted
+
+if TYPE_CHECKING:
+    from copem_replay.experiment import EgoTopic
 
 EGO = "ego"
 """Id of an ego that is no object of any list."""
@@ -188,8 +191,7 @@ def in_world(found: Listed, around: Surroundings, place: str) -> Listed:
                 f"{place}: lists are in the frame {name!r}, the ego in {world!r}, and no transform of the recording "
                 "says how they lie"
             )
-        turn = Rotation.from_quat(placed.rotation[back])
-        values[rows, _X : _Z + 1] = turn.apply(values[rows, _X : _Z + 1]) + placed.position_m[back]
+        values[rows, _X : _Z + 1] = turned(placed.rotation[back], values[rows, _X : _Z + 1]) + placed.position_m[back]
         yaw = yaw_of(placed.rotation)[back]
         cos, sin = np.cos(yaw), np.sin(yaw)
         values[rows, _YAW] += yaw
@@ -235,7 +237,7 @@ def with_ego(columns: Columns, around: Surroundings) -> Columns:
     placed = course.at(columns.stamp_ns)
     length, width, height = asked.size_m if asked is not None and asked.size_m is not None else NOMINAL_M
     ahead = (asked.centre_from_rear_axle_m if asked is not None else None) or 0.0
-    centre = placed.position_m + Rotation.from_quat(placed.rotation).apply([ahead, 0.0, height / 2])
+    centre = placed.position_m + turned(placed.rotation, np.array([ahead, 0.0, height / 2]))
     yaw = yaw_of(placed.rotation)
     rows = np.full((len(yaw), len(VALUES)), np.nan)
     rows[:, : _Z + 1], rows[:, _YAW] = centre, yaw

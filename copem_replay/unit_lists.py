@@ -33,7 +33,7 @@ def read_listed(path: Path, topic: str, scene: Scene, around: Surroundings | Non
     try:
         return _read(log, topic, scene, around)
     except container.BrokenIndexError as error:
-        return _read(container.from_start(path, error.__cause__, log.channels), topic, scene, around)
+        return _read(log.from_start(error), topic, scene, around)
 
 
 def _read(log: container.Log, topic: str, scene: Scene, around: Surroundings | None) -> RecordedLists | None:

@@ -25,7 +25,8 @@ from copem_replay.colours import configuration_colours
 from copem_replay.families import OSI_CHANNEL, Family, ListWriter, Osi, osi_version, topics_of
 from copem_replay.formats import detail
 from copem_replay.fusion.belief import Belief
-from copem_replay.passthrough import Catalogue, Original
+from copem_replay.originals import Source, source_of
+from copem_replay.passthrough import Catalogue
 from copem_replay.tracks import SAME_INSTANT_NS, Scene, Tracks
 
 OSI_RECORD = "net.asam.osi.trace"
@@ -54,7 +55,7 @@ def write_mcap(
 
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
-    original = Original(source)
+    original = source_of(source)
     family = family or Osi()
     rest = iter(beliefs)
     first = next(rest)  # it tells the configurations and the units
@@ -127,7 +128,7 @@ def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]
     return events
 
 
-def _kept(original: Original) -> dict[str, dict[str, str]]:
+def _kept(original: Source) -> dict[str, dict[str, str]]:
     """The input's metadata records, without what its new messages belie."""
     records = dict(original.metadata)
     rosbag = records.pop(ROSBAG_RECORD, {})
@@ -135,7 +136,7 @@ def _kept(original: Original) -> dict[str, dict[str, str]]:
     return records | ({ROSBAG_RECORD: rest} if rest else {})
 
 
-def _osi_record(original: Original, osi_version: str, protobuf: str) -> dict[str, str]:
+def _osi_record(original: Source, osi_version: str, protobuf: str) -> dict[str, str]:
     """The input's record, its ranges of versions widened to ours; a new one where it had none."""
     record = dict(original.metadata.get(OSI_RECORD, {}))
     for what, ours in (("osi", osi_version), ("protobuf", protobuf)):

@@ -23,6 +23,10 @@ from recordings import Obj, truth_topic, write_mcap, write_recording
 
 ROOT = Path(__file__).parents[1]
 COMMAND = Path(sys.executable).with_name("copem-replay")
+REINDEX = (
+    ".: expected a recording, found a folder without metadata.yaml; name its files as logs of their own, or let "
+    "`ros2 bag reindex` write it: then they are one"
+)
 NO_WIDTH = {"COLUMNS": "40", "TERM": "xterm-256color", "FORCE_COLOR": "1"}
 
 
@@ -529,8 +533,8 @@ class TestOptions:
             ("none.mcap", "none.mcap: no such file"),
             ("x*.mcap", "--log: no file matches 'x*.mcap'"),
             ("e.yaml", "e.yaml: expected an MCAP file, found one that starts with b'version: 1\\nlogs:'"),
-            (".", ".: expected an MCAP file, found a directory"),
-            ("", ".: expected an MCAP file, found a directory"),
+            (".", REINDEX),
+            ("", REINDEX),
             ("x" * 300, "x" * 300 + ": no such file"),
         ],
     )

@@ -48,7 +48,28 @@ def test_absent_file(path):
 
 
 def test_directory(tmp_path):
-    assert problem(tmp_path) == "expected an MCAP file, found a directory"
+    assert problem(tmp_path) == "expected a recording, found a folder without metadata.yaml"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        ("bag_0.db3", b"SQLite format 3\0" + bytes(84), "a SQLite file, which is not read; of a rosbag2 folder, `ros2"),
+        ("a.osi.xz", b"\xfd7zXZ\0", "compressed as a whole, which is not read; unpack it first: xz -d a.osi.xz"),
+        (
+            "a.mcap.zstd",
+            b"\x28\xb5\x2f\xfd",
+            "compressed as a whole, which is not read; unpack it first: zstd -d a.mcap",
+        ),
+        ("a.txth", b"version {", "text, which is not read; OSI traces are read as .osi (messages in binary) or .mcap"),
+        ("a.txt", b"\x0a$$__$$", "text, which is not read; OSI traces are read as .osi"),
+        ("metadata.yaml", b"rosbag2:", "the description of a rosbag2 folder; give the folder it is in"),
+    ],
+)
+def test_files_that_are_known_otherwise(tmp_path, name, content, why):
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert problem(path).startswith(why)
 
 
 def test_empty_file(path):

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from copem_replay.formats.poses import Poses
-from copem_replay.frames import Frames, Placed, course_of, yaw_of
+from copem_replay.frames import Frames, Placed, course_of
+from copem_replay.rotation import yaw_of
 
 Sample = tuple[float, float, float, float]
 """Seconds, x, y, yaw in degrees."""

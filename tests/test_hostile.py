@@ -18,11 +18,13 @@ from copem_replay.read import read
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
+import fuzz_containers  # noqa: E402
 import fuzz_read  # noqa: E402
-from fuzz_container import Message, Model, Piece, Raw, Sample, record  # noqa: E402
+from fuzz_container import Message, Model, Piece, Raw, Sample, record, taken_apart  # noqa: E402
 from fuzz_mutate import bomb, varint  # noqa: E402
 from fuzz_samples import json_updates, markers, poses_and_lists, protobuf_updates  # noqa: E402
 
+OSI = taken_apart(ROOT / "logs/tc016d.mcap", 10)
 TOO_LARGE = "a chunk holds more than 256 MiB"
 
 
@@ -61,6 +63,12 @@ def test_two_thousand_hostile_files_end_well():
     assert found["inputs"] == 2000
     assert found["outcomes"]["read"] > 500  # not all is refused: what was hit is also read
     assert found["outcomes"]["refused"] > 300
+
+
+def test_inputs_come_in_every_container(tmp_path):
+    made = [fuzz_containers.put([poses_and_lists(), OSI], f"1:{k}", tmp_path)[0] for k in range(60)]
+    assert {p.suffix for p in made} == {".mcap", ".osi", ""}
+    assert all(p.exists() for p in made)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
@@ -208,7 +216,7 @@ def test_names_cannot_break_a_line(path):
     sample.channels[0].topic = b"a\nb\x1b[31m"
     sample.schemas[0].name = b"some\nthing"
     written(path, whole(sample))
-    assert line(path).endswith(r"the file holds some\nthing (json) on a\nb\x1b[31m")
+    assert r"; it holds some\nthing (json) on a\nb\x1b[31m; " in line(path)
 
 
 def test_errors_are_lines():

@@ -2,10 +2,10 @@
 
     python tools/fuzz_read.py --inputs 20000 --seed 1 --minutes 30
 
-Every input is one file made from a seed. It is surveyed and read, then its other lists are read and its messages
-copied, in a process whose memory is watched and that is ended when either takes more than 10 s of computing. Good ends:
-it was read (and what was skipped is said), or it is refused in single lines. Printed are lines of JSON: each defect
-with its seed and the file that shows it, at the end the counts.
+Every input is a file, or a folder of rosbag2, made from a seed. It is surveyed and read, then its other lists are read
+and its messages copied, in a process whose memory is watched and that is ended when either takes more than 10 s of
+computing. Good ends: it was read (and what was skipped is said), or it is refused in single lines. Printed are lines of
+JSON: each defect with its seed and where the input is that shows it, at the end the counts.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -36,10 +37,11 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
 
     It is surveyed and read; `looked` is called then, and its other lists are read and its messages copied.
     """
-    from copem_replay import container, lists, passthrough, unit_lists
+    from copem_replay import container, lists, unit_lists
     from copem_replay.errors import InputError, RecordingError
     from copem_replay.formats import osi
     from copem_replay.info import describe, survey
+    from copem_replay.originals import source_of
     from copem_replay.read import read
 
     said: list[str] = []
@@ -70,7 +72,7 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
                     except RecordingError as error:
                         said += error.problems
             try:
-                original = passthrough.Original(path)
+                original = source_of(path)
                 for _message in original.messages({number: number for number in original.channels}):
                     pass
             except RecordingError as error:
@@ -97,11 +99,11 @@ def _peak_bytes() -> int:
 
 def _serve(pipe: Any, folder: str, most: int, own: bool) -> None:
     """Make and read the inputs that are asked for, until there are no more."""
-    from fuzz_mutate import hostile
+    from fuzz_containers import put
     from fuzz_samples import samples
 
     all_samples = samples(most, own=own)
-    path, warm = Path(folder) / "input.mcap", Path(folder) / "warm.mcap"
+    warm = Path(folder) / "warm.mcap"
     for sample in all_samples:  # compiles
         from fuzz_container import Model, Piece
 
@@ -112,10 +114,8 @@ def _serve(pipe: Any, folder: str, most: int, own: bool) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (room, room))
     pipe.send("ready")
     while (seed := pipe.recv()) is not None:
-        data, done = hostile(all_samples, seed)
-        path.write_bytes(data)
-        del data
-        pipe.send({"seed": seed, "done": done})
+        path, done = put(all_samples, seed, Path(folder))
+        pipe.send({"seed": seed, "done": done, "file": str(path)})
         Path("/proc/self/clear_refs").write_text("5")
         begin = time.process_time()
         found = outcome(path, lambda: pipe.send(None))
@@ -196,10 +196,8 @@ def fuzz(
             worst_s = max(worst_s, (found["seconds"], name))
             worst_bytes = max(worst_bytes, (found["bytes"], name))
             if found["outcome"] == "defect":
-                if keep is not None:
-                    keep.mkdir(parents=True, exist_ok=True)
-                    found["file"] = str(keep / f"{name.replace(':', '_')}.mcap")
-                    Path(found["file"]).write_bytes((Path(folder) / "input.mcap").read_bytes())
+                if keep is not None and "file" in found:
+                    found["file"] = str(_kept(Path(found["file"]), keep / name.replace(":", "_")))
                 found.pop("said", None)
                 defects.append(found)
                 print(json.dumps(found), flush=True)
@@ -213,6 +211,17 @@ def fuzz(
         "worst_mb_seed": worst_bytes[1],
         "defects": defects,
     }
+
+
+def _kept(made: Path, place: Path) -> Path:
+    """The input put where it stays."""
+    place = place / made.name
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if made.is_dir():
+        shutil.copytree(made, place, dirs_exist_ok=True)
+    else:
+        shutil.copyfile(made, place)
+    return place
 
 
 def main() -> int:

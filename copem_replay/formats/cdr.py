@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -158,6 +159,7 @@ def _walked(
 _SEPARATOR = re.compile(r"^={10,}[ \t]*$", re.MULTILINE)
 
 
+@lru_cache(maxsize=32)  # one is asked for several times: to look, for the truth, for the lists of units
 def _parsed(text: str, name: str, encoding: str) -> dict[str, Any]:
     """The types a schema defines, by name. Raises whatever rosbags does."""
     # Imported here: recordings of other kinds have no use for it.
