@@ -29,6 +29,7 @@ from copem_replay.onset import Looks, looks
 from copem_replay.read import Recording
 from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
+from copem_replay.sight import first_sights, in_sight_s
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks
 
 BLOCK_BYTES = 200_000_000
@@ -66,6 +67,11 @@ class Replay:
         if braking is None:
             return {}
         return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
+
+    @cached_property
+    def first_sights_s(self) -> Float:
+        """(U, M) when each modelled unit first has each look in sight; inf: never."""
+        return first_sights(self.measured, self.looks)
 
     @cached_property
     def surroundings(self) -> Surroundings:
@@ -151,7 +157,8 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | N
     """What runs (S,) give: `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
     measure = experiment.measure
     everything = _needs_all(experiment)
-    events = _by_truth_id(replay, experiment, runs, equipped, there)
+    sight_s = _in_sight(replay, experiment, equipped, there)
+    events = _by_truth_id(replay, experiment, runs, equipped, there, sight_s)
     appraisals: dict[str, Appraisal] = {}
     if everything or measure.conflict is not None:
         world = replay.world(experiment, measured_only=not everything)
@@ -160,7 +167,7 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | N
             if everything:
                 appraisal = appraise(replay.surroundings, replay.looks, believed, measure, len(runs))
                 if name not in events or measure.match.always:
-                    events[name] = Events(believed.heard.units, appraisal.detections)
+                    events[name] = Events(believed.heard.units, appraisal.detections, sight_s[name])
                 appraisals[name] = appraisal
             if measure.conflict is not None:
                 events[name] = replace(events[name], foreseen_s=_foreseen(replay, believed, appraisal, experiment))
@@ -169,8 +176,23 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | N
     return Outcome(replay.scene.log, runs, rows, appraisals)
 
 
+def _in_sight(replay: Replay, experiment: Experiment, equipped: Bool | None, there: Bool | None) -> dict[str, Float]:
+    """By configuration when any of its units first has each look in sight: (S | 1, M)."""
+    equipped = equipped if there is None else there[None]
+    fleet = fleet_of(experiment, replay.scene).experiment
+    return {
+        name: in_sight_s(replay.first_sights_s, fleet, configuration, equipped)
+        for name, configuration in fleet.configurations.items()
+    }
+
+
 def _by_truth_id(
-    replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None
+    replay: Replay,
+    experiment: Experiment,
+    runs: Int,
+    equipped: Bool | None,
+    there: Bool | None,
+    sight_s: dict[str, Float],
 ) -> dict[str, Events]:
     """Detections of the configurations that have truth ids: they need no states, only who was listed."""
     world = replay.world(experiment, measured_only=True)
@@ -188,7 +210,7 @@ def _by_truth_id(
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
         )
-        events[name] = Events(heard.units, result)
+        events[name] = Events(heard.units, result, sight_s[name])
     return events
 
 
