@@ -65,11 +65,12 @@ def _soonest(study: Study) -> Html:
     if len(later) == others:
         sure = f", sooner than {'each of ' if others > 1 else ''}the other{'s' if others > 1 else ''}"
     elif undecided:
-        sure = f", but cannot be told from {undecided} of the other {others} configurations"
+        whom = f"{undecided} of the other {others}" if undecided < others else f"the other{f' {others}' * (others > 1)}"
+        sure = f", but cannot be told from {whom}"
     else:
-        sure = ", by differences without an interval"
-    has = " knew soonest" if len(later) == others else " has the shortest mean time"
-    return joined([name, f"{has}, {cell(mean_s)} s ({counted_as}){sure}."])
+        sure = "; how sure that is, no interval tells"
+    has = " knew soonest, after" if len(later) == others else " has the shortest mean time,"
+    return joined([name, f"{has} {cell(mean_s)} s ({counted_as}){sure}."])
 
 
 def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
@@ -141,8 +142,9 @@ def _detected(study: Study, share: pd.Series) -> Iterator[str]:
     if missed:
         worst, least = max(missed, key=lambda one: one[1]), min(missed, key=lambda one: one[1])
         rows = "of the rows (objects × runs) never detected"
-        if len(missed) == 1:
-            yield f"{worst[0]}: {percent(worst[1])} {rows}. Who that is, is said below."
+        if percent(worst[1]) == percent(least[1]):
+            whom = some([name for name, _ in missed])
+            yield f"{whom}: {'each ' if len(missed) > 1 else ''}{percent(worst[1])} {rows}. Who that is, is said below."
         else:
             yield (
                 f"{len(missed)} configurations missed somebody, from {least[0]} with {percent(least[1])} to {worst[0]} "
@@ -186,7 +188,7 @@ def _accuracy(study: Study) -> Iterator[str]:
     if "gospa_m" not in rows:
         return
     known = rows.loc[list(study.contenders), "gospa_m"].dropna().astype(float)
-    if len(known) > 1:
+    if len(known) > 1 and known.min() < known.max():
         best, worst = str(known.idxmin()), str(known.idxmax())
         yield (
             f"The best lists, places, misses and false entries taken together, had {best}: GOSPA "

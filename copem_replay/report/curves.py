@@ -9,7 +9,7 @@ import numpy as np
 from copem_replay.plot.appearance import Appearance
 from copem_replay.plot.bands import RESAMPLES
 from copem_replay.plot.captions import percent
-from copem_replay.plot.curves import MOST_BANDS, Curve, curve_of, exact_curve, time_axis
+from copem_replay.plot.curves import Curve, curve_of, exact_curve, time_axis
 from copem_replay.report.drawing import Drawn, axis, card, label, layout, line_of, numbers, outlined, place, rgb, swatch
 from copem_replay.report.markup import Html, joined, tag
 from copem_replay.report.study import Study
@@ -18,6 +18,8 @@ from copem_replay.table import cell
 from copem_replay.tracks import Float
 
 _TITLE, _SHARE = "Time since the clock started (s)", "Known by then"
+_MOST_BANDS = 3
+"""More bands than this hide each other where there are small figures for them (chosen)."""
 
 
 def curves(study: Study) -> tuple[Html, list[Drawn]]:
@@ -32,7 +34,7 @@ def curves(study: Study) -> tuple[Html, list[Drawn]]:
         )
     exact = {name: exact_curve(results.exact, name) for name in study.names} if results.exact is not None else {}
     limits = time_axis([*drawn.values(), *exact.values()])
-    one_by_one = len(study.names) > MOST_BANDS
+    one_by_one = len(study.names) > _MOST_BANDS
     traces: list[Drawn] = []
     for k, (name, curve) in enumerate(drawn.items()):
         look, own = study.looks[name], {"meta": k, "name": label(name)}

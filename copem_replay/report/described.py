@@ -38,10 +38,10 @@ def question(study: Study) -> str:
         whom = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
     else:
         whom = "everybody who moves"
-    which = counted(len(study.names), "configuration")
+    which = f"each of {len(study.names)} configurations" if len(study.names) > 1 else "the one configuration"
     far = "" if experiment.measure.distance_to != "ego" or experiment.ego == "none" else ", and how far away,"
     return (
-        f"On {logs(study)}: how soon{far} would the receiver have known of {whom}, with each of {which} of perception "
+        f"On {logs(study)}: how soon{far} would the receiver have known of {whom}, with {which} of perception "
         "units, latencies and fusion?"
     )
 

@@ -11,7 +11,7 @@ import pandas as pd
 from copem_replay.plot.appearance import Appearance
 from copem_replay.plot.captions import percent
 from copem_replay.plot.distances import FAIL, NEUTRAL, PASS, verdicts
-from copem_replay.report.drawing import FAINT, INK, Drawn, axis, card, layout, numbers, rgb, swatch
+from copem_replay.report.drawing import FAINT, INK, Drawn, axis, box, card, layout, numbers, rgb, swatch
 from copem_replay.report.markup import Html, joined, tag
 from copem_replay.report.study import Study
 from copem_replay.wording import counted
@@ -193,14 +193,10 @@ def _said(study: Study, event: Event, counts: dict[str, dict[str, Any]], judged:
 
 def _key() -> Html:
     """What bars of each verdict look like, whatever the configuration."""
-    cross = Html('<path d="M0 0L14 14M14 0L0 14" stroke="black" stroke-width="2"></path>')
     boxes = {
-        "passes (in the configuration's colour)": tag("rect", width="14", height="14", fill="#7a7a7a"),
-        "fails": joined([tag("rect", width="14", height="14", fill="white", stroke="black"), cross]),
-        "not in conflict": tag("rect", width="14", height="14", fill="#cfcfcf", stroke=FAINT),
+        "passes (in the configuration's colour)": box("#7a7a7a"),
+        "fails": box("white", "M1 1L13 13M13 1L1 13"),
+        "not in conflict": box("#cfcfcf"),
     }
-    items = [
-        tag("span", tag("svg", box, class_="box", viewBox="0 0 14 14", aria_hidden="true"), word)
-        for word, box in boxes.items()
-    ]
+    items = [tag("span", drawn, word) for word, drawn in boxes.items()]
     return tag("p", *items, class_="key")

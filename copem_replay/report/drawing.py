@@ -77,6 +77,13 @@ def swatch(look: Appearance) -> Html:
     return tag("svg", *edge, line(look.colour, width), class_="swatch", viewBox="0 0 44 14", aria_hidden="true")
 
 
+def box(fill: str, marks: str = "", colour: str = "black") -> Html:
+    """A piece of a bar, for keys: filled, with `marks` on it, a path in a square of 14."""
+    shape = tag("rect", x="0.5", y="0.5", width="13", height="13", fill=fill, stroke="#404040")
+    drawn = [tag("path", d=marks, stroke=colour, stroke_width="1.6", fill="none")] if marks else []
+    return tag("svg", shape, *drawn, class_="box", viewBox="0 0 14 14", aria_hidden="true")
+
+
 def axis(title: str, **more: Any) -> Drawn:
     """An axis."""
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterable, Sequence
 
 from copem_replay.wording import printable
@@ -35,8 +36,8 @@ def joined(parts: Iterable[str], between: str = "") -> Html:
 
 
 def breakable(name: str) -> Html:
-    """The name of a column or key, that may be broken after an underscore or a dot."""
-    return Html(text(name).replace("_", "_<wbr>").replace(".", ".<wbr>"))
+    """A name that may be broken after an underscore, a colon or a dot that is no decimal point."""
+    return Html(re.sub(r"([_:](?=\w)|\.(?=[a-z]))", r"\1<wbr>", text(name)))
 
 
 def table(head: Sequence[str], rows: Iterable[str], *, caption: str = "", id_: str | None = None) -> Html:

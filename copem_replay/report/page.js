@@ -13,12 +13,11 @@
 
   const draw = (figure) => {
     let { data, layout } = figure;
-    if (figure.rows && left.size) {
+    if (figure.row && left.size) {
       data = data.map((trace) => ({
         ...trace, x: kept(trace.x), y: kept(trace.y), ...(trace.text ? { text: kept(trace.text) } : {}),
       }));
-      const rows = figure.data[0].y.length;
-      layout = { ...layout, height: layout.height - (layout.height - 110) * (left.size / rows) };
+      layout = { ...layout, height: layout.height - figure.row * left.size };
     } else if (left.size) {
       data = data.map((trace) => ("meta" in trace ? { ...trace, visible: !left.has(trace.meta) } : trace));
     }
@@ -31,7 +30,7 @@
     for (const card of document.querySelectorAll(".card[data-configuration]")) {
       card.hidden = left.has(Number(card.dataset.configuration));
     }
-    for (const figure of figures) if (figure.rows || figure.data.some((trace) => "meta" in trace)) draw(figure);
+    for (const figure of figures) if (figure.row || figure.data.some((trace) => "meta" in trace)) draw(figure);
     for (const plot of document.querySelectorAll(".card:not([hidden]) .plot")) Plotly.Plots.resize(plot);
   };
   for (const key of keys) {

@@ -26,7 +26,7 @@ class Study:
     """Results, and what of them is compared.
 
     `baseline`: None where there is nothing to compare; `regret` are the differences to it. `best`: the configuration
-    that knows soonest of those that are not the truth; None: nobody was measured. `lead` are the differences to that.
+    that knows soonest of those that are not the truth; None: nobody was measured. `lead` are their differences to it.
     """
 
     results: Results
@@ -76,7 +76,11 @@ def load_study(folder: Path, baseline: str | None = None) -> Study:
     regret = compare([folder], baseline=against)
     lead = None
     if len(contenders) > 1:
-        lead = regret if best == against else compare([folder], configurations=contenders, baseline=best)
+        lead = (
+            regret
+            if best == against and contenders == names
+            else compare([folder], configurations=contenders, baseline=best)
+        )
     return Study(results, provenance, against, regret, best, lead)
 
 

@@ -79,9 +79,7 @@ def _figure(id_: str, study: Study, part: pd.DataFrame, kind: str, what: str) ->
         traces += outlined(trace, look)
         traces[-1] = traces[-1] | {"error_y": bars | {"type": "data", "symmetric": False, "thickness": 1, "width": 3}}
     share = what != "ttd_median_s"
-    y = axis(_WHAT[what], nticks=6) | (
-        {"range": [-0.03, 1.05], "tickformat": ".0%"} if share else {"rangemode": "tozero"}
-    )
+    y = axis("", nticks=6) | ({"range": [-0.03, 1.05], "tickformat": ".0%"} if share else {"rangemode": "tozero"})
     x = axis(AXES.get(kind, kind), tickformat=".0%") if kind == "share" else axis(AXES.get(kind, kind))
     values = np.unique(part["value"].to_numpy(dtype=float))
     if kind == "rate_hz" and values[0] > 0 and values[-1] / values[0] >= 8:

@@ -14,7 +14,7 @@ import pandas as pd
 from copem_replay.compare.regret import METRICS
 from copem_replay.compare.tables import comparison_lines, plain, signed
 from copem_replay.report.drawing import swatch
-from copem_replay.report.markup import Html, joined, listed, table, tag
+from copem_replay.report.markup import Html, breakable, joined, listed, table, tag
 from copem_replay.report.study import Study
 from copem_replay.table import cell
 
@@ -112,7 +112,7 @@ def _table(study: Study, part: Part, columns: dict[str, str]) -> Html:
 
 def named(study: Study, name: str) -> Html:
     """The head of a configuration's row."""
-    return tag("th", tag("span", swatch(study.looks[name]), tag("span", name), class_="named"), scope="row")
+    return tag("th", tag("span", swatch(study.looks[name]), tag("span", breakable(name)), class_="named"), scope="row")
 
 
 def _cell(row: dict[str, Any], name: str) -> Html:

@@ -23,7 +23,7 @@ import pandas as pd
 from copem_replay.believe import by_truth
 from copem_replay.experiment import Experiment
 from copem_replay.plot.captions import percent, short_names
-from copem_replay.report.drawing import FAINT, Drawn, axis, label, layout, numbers, place, rgb
+from copem_replay.report.drawing import FAINT, Drawn, axis, box, label, layout, numbers, place, rgb
 from copem_replay.report.markup import Html, joined, table, tag
 from copem_replay.report.study import Study
 from copem_replay.report.tables import named
@@ -43,26 +43,22 @@ STAGES = {
     SINCE_CAPTURED: "from that capture until then, where it is not known how much of it is transport: units have "
     "different latencies, or recorded ones",
 }
-_MARKERS: dict[str, Drawn] = {
-    HIDDEN: {"color": "#d9d9d9"},
-    UNLISTED: {
-        "color": "#9c9c9c",
-        "pattern": {"shape": "/", "fgcolor": "white", "bgcolor": "#8c8c8c", "solidity": 0.25, "size": 7},
-    },
-    UNTIL_CAPTURED: {
-        "color": "#d9d9d9",
-        "pattern": {"shape": "/", "fgcolor": "#8c8c8c", "bgcolor": "white", "solidity": 0.25, "size": 7},
-    },
-    TRANSPORT: {"color": "#404040"},
-    FUSION: {
-        "color": "white",
-        "pattern": {"shape": ".", "fgcolor": "black", "bgcolor": "white", "solidity": 0.35, "size": 6},
-    },
-    SINCE_CAPTURED: {
-        "color": "#6e6e6e",
-        "pattern": {"shape": "x", "fgcolor": "white", "bgcolor": "#6e6e6e", "solidity": 0.2, "size": 8},
-    },
+_FILLS = {
+    HIDDEN: ("#d9d9d9", "", ""),
+    UNLISTED: ("#8c8c8c", "/", "white"),
+    UNTIL_CAPTURED: ("white", "/", "#8c8c8c"),
+    TRANSPORT: ("#404040", "", ""),
+    FUSION: ("white", ".", "black"),
+    SINCE_CAPTURED: ("#6e6e6e", "x", "white"),
 }
+"""Of each stage its fill, and the pattern on it with its colour."""
+_MARKS = {
+    "": "",
+    "/": "M1 8L8 1M1 14L14 1M7 13L13 7",
+    ".": "M3 4h2M9 4h2M3 10h2M9 10h2",
+    "x": "M1 1L13 13M13 1L1 13M1 7L7 13M7 1L13 7M7 1L1 7M13 7L7 13",
+}
+_ROW_PX = 30
 
 
 def waterfall(study: Study) -> tuple[Html, list[Drawn]]:
@@ -77,11 +73,11 @@ def waterfall(study: Study) -> tuple[Html, list[Drawn]]:
     there = [stage for stage in STAGES if any(stage in of for of in means.values())]
     known = {name: (int(rows["detected"].sum()), len(rows)) for name, rows in by_name.items()}
     said = (
-        "Where the time goes, on the average over the looks in which the object became known, whose number is beside "
-        "each bar; those that never did have no stages. So bars of configurations that miss many are not about the "
-        "same looks, and their sum is not ttd_rmst_s."
+        "Where the time goes, on the average over the looks in which the object became known; how many that is, where "
+        "not all, is beside the bar. Those that never did have no stages, so bars of configurations that miss many are "
+        "not about the same looks, and their sum is not ttd_rmst_s."
     )
-    terms = [part for stage in there for part in (tag("dt", stage), tag("dd", STAGES[stage]))]
+    terms = [part for stage in there for part in (tag("dt", _box(stage), stage), tag("dd", STAGES[stage]))]
     parts = [
         tag("p", said),
         place("waterfall", "mean duration of the stages from the start of the clock to knowing, by configuration"),
@@ -137,26 +133,35 @@ def _figure(
             "name": stage,
             "y": rows,
             "x": numbers(np.array([means[name].get(stage, np.nan) for name in study.names]), 6),
-            "marker": _MARKERS[stage] | {"line": {"color": "#404040", "width": 0.8}},
+            "marker": _marker(stage),
             "hovertemplate": "%{y}: %{x:.4~g} s " + stage + "<extra></extra>",
         }
         for stage in there
     ]
     text = [_beside(sum_s, *known[name]) for name, sum_s in zip(study.names, total, strict=True)]
     beside = {"type": "scatter", "mode": "text", "y": rows, "x": numbers(np.array(total), 6), "text": text}
-    traces.append(beside | {"textposition": "middle right", "showlegend": False, "hoverinfo": "skip"})
+    traces.append(beside | {"textposition": "middle right", "hoverinfo": "skip"})
     drawn = layout(
-        110 + 30 * len(rows),
+        64 + _ROW_PX * len(rows),
         axis("Mean time (s)", range=[0, round(1.3 * max(total), 5) or 1.0]),
         axis("", autorange="reversed", showgrid=False, ticks="", ticklabelstandoff=2, type="category"),
         barmode="stack",
         bargap=0.3,
-        showlegend=True,
-        legend={"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom", "xanchor": "left", "traceorder": "normal"},
     )
-    drawn["margin"] = drawn["margin"] | {"t": 44, "l": 10}
+    drawn["margin"] = drawn["margin"] | {"l": 10}
     drawn["xaxis"]["linecolor"] = FAINT
-    return {"id": "waterfall", "data": traces, "layout": drawn, "rows": True}
+    return {"id": "waterfall", "data": traces, "layout": drawn, "row": _ROW_PX}
+
+
+def _marker(stage: str) -> Drawn:
+    fill, shape, colour = _FILLS[stage]
+    pattern = {"shape": shape, "fgcolor": colour, "bgcolor": fill, "solidity": 0.3, "size": 7}
+    return {"color": fill, "line": {"color": "#404040", "width": 0.8}} | ({"pattern": pattern} if shape else {})
+
+
+def _box(stage: str) -> Html:
+    fill, shape, colour = _FILLS[stage]
+    return box(fill, _MARKS[shape], colour)
 
 
 def _beside(total_s: float, detected: int, rows: int) -> str:
