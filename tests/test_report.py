@@ -26,7 +26,7 @@ from copem_replay.report.markup import Html, tag
 from copem_replay.report.never import misses
 from copem_replay.report.page import page
 from copem_replay.report.study import load_study
-from copem_replay.report.waterfall import FUSION, HIDDEN, SINCE_CAPTURED, TRANSPORT, UNLISTED, UNTIL_CAPTURED, stages
+from copem_replay.report.waterfall import FUSION, HIDDEN, IN_SIGHT, SINCE_CAPTURED, TRANSPORT, UNTIL_CAPTURED, stages
 from copem_replay.table import summary_text
 from report_pages import ALONE, EVERY, ONE, Page, changed, drive, replayed
 
@@ -161,8 +161,8 @@ class TestWords:
         lines = lines_of(made)
         mean_s = float(summary_rows(made)["half"]["ttd_rmst_s"])
         assert lines[2] == (
-            f"half knew soonest, after {mean_s:.4g} s (never detected counting as 4.5 s), sooner than each of the "
-            "others."
+            f"half knew soonest, after {mean_s:.4g} s on the average (never detected counting as 4.5 s), sooner "
+            "than the other 3."
         )
         difference = 0.5 - mean_s
         assert lines[3].startswith(
@@ -191,7 +191,7 @@ class TestWords:
     def test_an_interval_that_includes_0_is_no_difference(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
         lines = lines_of(replayed(tmp_path, text))
-        assert lines[2].endswith(", but cannot be told from the other.")
+        assert lines[2].endswith(", but cannot be told from hit.")
         assert lines[3] == (
             "No difference to it can be shown, the interval including 0: hit (±0 s [0, 0]). That is not to say that "
             "there is none."
@@ -273,12 +273,12 @@ class TestWaterfall:
         cells = read.tables["stages"]
         shown = {name: {stage: cell.text for stage, cell in row.items()} for name, row in cells.items()}
         assert shown["late"] == {
-            "detected": "6 of 6", HIDDEN: "0", UNLISTED: "0", UNTIL_CAPTURED: "–", TRANSPORT: "0.5", FUSION: "0",
+            "detected": "6 of 6", HIDDEN: "0", IN_SIGHT: "0", UNTIL_CAPTURED: "–", TRANSPORT: "0.5", FUSION: "0",
             "sum": "0.5",
         }  # fmt: skip
         assert (shown["GT"][UNTIL_CAPTURED], shown["GT"][HIDDEN], shown["GT"]["sum"]) == ("0", "–", "0")
         assert (shown["never"]["detected"], shown["never"]["sum"]) == ("0 of 6", "–")
-        assert float(cells["half"][UNLISTED].value or "nan") == pytest.approx(float(cells["half"]["sum"].value or 0))
+        assert float(cells["half"][IN_SIGHT].value or "nan") == pytest.approx(float(cells["half"]["sum"].value or 0))
 
     @staticmethod
     def rows(**columns: Any) -> pd.DataFrame:
@@ -301,13 +301,13 @@ class TestWaterfall:
         return stages(rows, type(experiment).model_validate(data), "it")
 
     def test_what_arrives_is_known_where_fusion_is_ideal(self, made: Path) -> None:
-        expected = {HIDDEN: 1.0, UNLISTED: 1.5, TRANSPORT: 2.5, FUSION: 0.0}
+        expected = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 2.5, FUSION: 0.0}
         assert self.stages(made, self.rows()) == expected
         assert self.stages(made, self.rows(), latency_s={"ego": 1.0, "default": 2.0}) == expected
 
     def test_latency_is_transport_and_the_rest_fusion(self, made: Path) -> None:
         gnn = {"fusion": {"kind": "gnn"}}
-        expected = {HIDDEN: 1.0, UNLISTED: 1.5, TRANSPORT: 1.5, FUSION: 1.0}
+        expected = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 1.5, FUSION: 1.0}
         assert self.stages(made, self.rows(), latency_s=1.5, **gnn) == expected
         assert self.stages(made, self.rows(), latency_s={"ego": 1.5, "weak": 1.5}, **gnn) == expected
         confirm = {"confirm": {"hits": 2, "of": 3}}
@@ -315,7 +315,7 @@ class TestWaterfall:
 
     def test_what_is_not_known_is_one_stage(self, made: Path) -> None:
         mixed = {"fusion": {"kind": "gnn"}, "latency_s": {"ego": 1.5, "weak": 1.0}}
-        assert self.stages(made, self.rows(), **mixed) == {HIDDEN: 1.0, UNLISTED: 1.5, SINCE_CAPTURED: 2.5}
+        assert self.stages(made, self.rows(), **mixed) == {HIDDEN: 1.0, IN_SIGHT: 1.5, SINCE_CAPTURED: 2.5}
         blind = self.rows(in_sight_s=[float("nan")] * 2)
         assert self.stages(made, blind) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
         older = self.rows().drop(columns="in_sight_s")
@@ -323,12 +323,12 @@ class TestWaterfall:
 
     def test_who_was_listed_while_hidden_was_hidden_until_then(self, made: Path) -> None:
         found = self.stages(made, self.rows(in_sight_s=[9.0, 2.0]))
-        assert found == {HIDDEN: 1.5, UNLISTED: 1.0, TRANSPORT: 2.5, FUSION: 0.0}
+        assert found == {HIDDEN: 1.5, IN_SIGHT: 1.0, TRANSPORT: 2.5, FUSION: 0.0}
 
     def test_only_the_detected_have_stages(self, made: Path) -> None:
         nan = float("nan")
         one = self.rows(detected=[True, False], captured_s=[3.0, nan], detection_s=[5.0, nan])
-        assert self.stages(made, one) == {HIDDEN: 1.0, UNLISTED: 1.0, TRANSPORT: 2.0, FUSION: 0.0}
+        assert self.stages(made, one) == {HIDDEN: 1.0, IN_SIGHT: 1.0, TRANSPORT: 2.0, FUSION: 0.0}
         assert self.stages(made, self.rows(detected=[False, False])) == {}
 
     def test_with_count_earlier_there_is_none(self, tmp_path: Path) -> None:
@@ -369,6 +369,21 @@ class TestFigures:
         assert low <= 20 < high, "known at 1.0 s, when the ego is at 10 m and the pedestrian at 30 m"
         assert figures["distances-1"]["layout"]["shapes"][0]["x0"] == pytest.approx(20)
         assert figures["distances-4"]["layout"]["shapes"] == []
+
+    def test_a_foreseen_collision_has_figures_and_verdicts_of_its_own(self, tmp_path: Path) -> None:
+        text = changed(ONE, *ALONE[2:], ("time_s: 0.5}}", "time_s: 0.5}, conflict: {horizon_s: 2.0}}"))
+        text = text.replace("braking: {", "braking: {brakes_for: conflict, ")
+        found = Page(page(load_study(replayed(tmp_path, text))))
+        figures = {figure["id"]: figure for figure in json.loads(found.data)}
+
+        def bars(id_: str) -> set[str]:
+            return {trace["name"] for trace in figures[id_]["data"] if trace["type"] == "bar"}
+
+        assert bars("distances-1") == {"not in conflict"}, "who brakes for the one is not judged at the other"
+        assert bars("foreseen-1") <= {"passes", "fails"}
+        assert bars("foreseen-1")
+        assert "Distance when the collision is foreseen" in found.words
+        assert list(found.tables["conflict"]) == ["GT", "late", "half"]
 
     def test_sweeps_have_a_figure_each(self, tmp_path: Path) -> None:
         text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"

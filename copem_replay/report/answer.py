@@ -62,15 +62,13 @@ def _soonest(study: Study) -> Html:
                        f"it with: {alone}."])  # fmt: skip
     later, alike, sooner, _ = _told_apart(study.lead)
     undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
+    whom = f"the other {others}" if others > 1 else study.lead.configurations[0]
+    has, sure = f" has the shortest mean time, {cell(mean_s)} s", "; how sure that is, no interval tells"
     if len(later) == others:
-        sure = f", sooner than {'each of ' if others > 1 else ''}the other{'s' if others > 1 else ''}"
+        has, sure = f" knew soonest, after {cell(mean_s)} s on the average", f", sooner than {whom}"
     elif undecided:
-        whom = f"{undecided} of the other {others}" if undecided < others else f"the other{f' {others}' * (others > 1)}"
-        sure = f", but cannot be told from {whom}"
-    else:
-        sure = "; how sure that is, no interval tells"
-    has = " knew soonest, after" if len(later) == others else " has the shortest mean time,"
-    return joined([name, f"{has} {cell(mean_s)} s ({counted_as}){sure}."])
+        sure = f", but cannot be told from {f'{undecided} of ' if undecided < others else ''}{whom}"
+    return joined([name, f"{has} ({counted_as}){sure}."])
 
 
 def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:

@@ -174,13 +174,15 @@ def _caption(study: Study, name: str, event: Event, found: dict[str, Any], judge
 def _said(study: Study, event: Event, counts: dict[str, dict[str, Any]], judged: bool) -> list[str]:
     lost = sum(found["gap"] for found in counts.values())
     braking = study.results.experiment.braking
-    lines = [
+    said = (
         "How far apart the centres of object and reference were at that instant, in truth: which share of a "
         "configuration's rows lies at which distance, all on the same axes. Dashed: the median over all rows, those "
         "that never got there ranking below every distance; without a line it is among them. Farther is earlier only "
         "while the two approach each other."
-        + (f" Without a bar: {counted(lost, 'detection')} while the truth has a gap." if lost else "")
-    ]
+    )
+    if event.key == "foreseen":
+        said = "The same at the first list that implied a collision."
+    lines = [said + (f" Without a bar: {counted(lost, 'detection')} while the truth has a gap." if lost else "")]
     if judged and braking is not None:
         what = "knows of the object" if braking.brakes_for == "object" else "foresees the collision"
         lines.append(

@@ -3,16 +3,16 @@
 | stage | from | to |
 |---|---|---|
 | hidden | the onset | the first list of any of the configuration's units in which it is in sight (`in_sight_s`) |
-| not yet listed | there | the newest capture that contributed to knowing (`captured_s`) |
+| in sight | there | the newest capture that contributed to knowing (`captured_s`) |
 | transport | there | the arrival of that list: captured plus latency |
 | fusion | there | the fused list with which it was known (`detection_s`) |
 
 Means over the rows that were detected, so that stages add up. An object listed while nobody had it in sight was hidden
-until it was listed. Of a confirmation only the newest capture is known: what it takes is *not yet listed*. Ideal fusion
-and the truth know from the list that brings it (one hit): all from its capture on is transport, nothing fusion.
-Otherwise transport is the latency, where all units have the same; else the two stages are one. So are the first two
-where it is not known when it was in sight: the truth needs no sight, and recorded units don't tell. With
-`count_earlier` times may be negative, and nothing is drawn.
+until it was listed. Of a confirmation only the newest capture is known: what it takes is spent *in sight*, as is the
+time in which another unit's list of the object is still on its way. Ideal fusion and the truth know from the list that
+brings it (one hit): all from its capture on is transport, nothing fusion. Otherwise transport is the latency, where all
+units have the same; else the two stages are one. So are the first two where it is not known when it was in sight: the
+truth needs no sight, and recorded units don't tell. With `count_earlier` times may be negative, and nothing is drawn.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from copem_replay.report.tables import named
 from copem_replay.table import cell
 from copem_replay.tracks import Float
 
-HIDDEN, UNLISTED, UNTIL_CAPTURED = "hidden", "not yet listed", "until captured"
+HIDDEN, IN_SIGHT, UNTIL_CAPTURED = "hidden", "in sight", "until captured"
 TRANSPORT, FUSION, SINCE_CAPTURED = "transport", "fusion", "since captured"
 STAGES = {
     HIDDEN: "from the start of the clock until any of the configuration's units has it in sight in a list it makes",
-    UNLISTED: "from there until the capture of the newest list that contributed to knowing it: out of range, missed by "
-    "the perception, between two lists, not yet confirmed",
+    IN_SIGHT: "from there until the capture of the newest list that contributed to knowing it: out of range, missed by "
+    "the perception, between two lists, not yet confirmed, or listed by a unit whose list was still on its way",
     UNTIL_CAPTURED: "from the start of the clock until that capture, where it is not known when the object was in "
     "sight: the truth needs no sight, and recorded units do not tell",
     TRANSPORT: "the latency of that list: making the message and sending it, of which the experiment says one number",
@@ -45,7 +45,7 @@ STAGES = {
 }
 _FILLS = {
     HIDDEN: ("#d9d9d9", "", ""),
-    UNLISTED: ("#8c8c8c", "/", "white"),
+    IN_SIGHT: ("#8c8c8c", "/", "white"),
     UNTIL_CAPTURED: ("white", "/", "#8c8c8c"),
     TRANSPORT: ("#404040", "", ""),
     FUSION: ("white", ".", "black"),
@@ -99,7 +99,7 @@ def stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, f
         result[UNTIL_CAPTURED] = captured_s - onset_s
     else:
         seen_s = np.fmin(sight_s, captured_s)
-        result |= {HIDDEN: seen_s - onset_s, UNLISTED: captured_s - seen_s}
+        result |= {HIDDEN: seen_s - onset_s, IN_SIGHT: captured_s - seen_s}
     result |= _since_captured(known_s - captured_s, experiment, name)
     # To a nanosecond: 3.9 − 3 is not 0.9.
     return {stage: float(np.round(values.mean(), 9)) + 0.0 for stage, values in result.items()}
