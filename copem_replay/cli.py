@@ -129,6 +129,7 @@ def run(
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Leave out logs that cannot be replayed.")
     ] = False,
+    report: Annotated[bool, typer.Option("--report", help="Write report.html, too.")] = False,
 ) -> int:
     """Replay, measure, write the results folder, print the summary."""
     from copem_replay.results import check_target, write_results
@@ -149,6 +150,10 @@ def run(
     if result.sweep is not None:
         print(_printable(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {folder / 'sweep.csv'}"))
     print(_printable(f"results in {folder}"))
+    if report:
+        from copem_replay.report import write_report
+
+        print(_printable(f"report in {write_report(folder)}"))
     return 1 if skipped else 0
 
 
@@ -222,6 +227,21 @@ def plot(
     files, notes = write_figures(load_results(folder), out, configurations=names, log=log, object_id=object, run=run)
     _complain(f"note: {note}" for note in notes)
     _print_blocks([[str(file) for file in files]])
+    return 0
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder.")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where it goes [DIR/report.html].")] = None,
+    baseline: Annotated[
+        str | None, typer.Option(metavar="C", help="What configurations are compared with [the one named ideal].")
+    ] = None,
+) -> int:
+    """What a results folder says, as one HTML file that opens offline: words, tables, figures, provenance."""
+    from copem_replay.report import write_report
+
+    print(_printable(f"report in {write_report(folder, out, baseline=baseline)}"))
     return 0
 
 

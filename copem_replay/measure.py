@@ -33,11 +33,13 @@ T = TypeVar("T", bound=np.generic)
 class Events:
     """What one configuration came to know and when, run by run: (S, M), or (1, M) where all runs agree.
 
-    `units`: names of those whose indices `detections` has. `foreseen_s`: when a collision was implied, NaN: never.
+    `units`: names of those whose indices `detections` has. `in_sight_s`: when any of its units had the object in sight,
+    NaN: never, or not known. `foreseen_s`: when a collision was implied, NaN: never.
     """
 
     units: tuple[str, ...]
     detections: Detections
+    in_sight_s: Float
     foreseen_s: Float | None = None
 
 
@@ -90,6 +92,7 @@ def _columns(
         "detected": ~np.isnan(detection_s),
         "detection_s": detection_s,
         "captured_s": flat(result.captured_s),
+        "in_sight_s": flat(known.in_sight_s),
         "time_to_detection_s": detection_s - onset_s,
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,

@@ -30,6 +30,7 @@ from copem_replay.onset import Looks, looks
 from copem_replay.read import Recording
 from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
+from copem_replay.sight import first_sights, in_sight_s
 from copem_replay.stretches import ROWS_A_STRETCH, WHOLE, Reach, Stretch, stretches
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks, spliced
 from copem_replay.units import Placed, place
@@ -69,6 +70,26 @@ class Replay:
         if braking is None:
             return {}
         return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
+
+    @property
+    def first_sights_s(self) -> Float:
+        """(U, M) when each modelled unit first has each look in sight; inf: never."""
+        return self._overview[0]
+
+    @property
+    def ever_met(self) -> Bool:
+        """(U,) whether any object ever meets a condition of the PEM of each modelled unit."""
+        return self._overview[1]
+
+    @cached_property
+    def _overview(self) -> tuple[Float, Bool]:
+        sights: list[Float] = []
+        met: list[Bool] = []
+        for stretch in self.stretches:
+            found = self.found(stretch)
+            sights.append(first_sights(found, self.looks))
+            met.append(found.ever_met)
+        return np.min(sights, axis=0), np.any(met, axis=0)
 
     @cached_property
     def surroundings(self) -> Surroundings:
@@ -143,7 +164,6 @@ class Outcome:
     runs: Int
     table: pd.DataFrame
     appraisals: dict[str, Appraisal]
-    met: Bool  # (U,) whether any object ever met a condition of each unit's PEM
 
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
@@ -212,14 +232,13 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
 def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None) -> Outcome:
     """What runs (S,) give: `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
     measure = experiment.measure
-    met = np.zeros(len(replay.placed.poses), dtype=bool)
-    events = _by_truth_id(replay, experiment, runs, equipped, there, met)
+    sight_s = _in_sight(replay, experiment, equipped, there)
+    events = _by_truth_id(replay, experiment, runs, equipped, there, sight_s)
     appraisals: dict[str, Appraisal] = {}
     if _needs_all(experiment) or measure.conflict is not None:
         receivers = Receivers(runs, there)
         judges: dict[str, _Judge] = {}
         for world in replay.worlds(experiment, there):
-            met |= world.found.ever_met
             around = _around(replay, world.stretch)
             for name, believed in receivers.believe(world):
                 if name not in judges:
@@ -230,12 +249,12 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | N
             if appraisal is not None:
                 appraisals[name] = appraisal
                 if name not in events or measure.match.always:
-                    events[name] = Events(judge.units, appraisal.detections)
+                    events[name] = Events(judge.units, appraisal.detections, sight_s[name])
             if foreseen_s is not None:
                 events[name] = replace(events[name], foreseen_s=foreseen_s)
     ordered = {name: events[name] for name in experiment.configurations}
     rows = table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, ordered)
-    return Outcome(replay.scene.log, runs, rows, appraisals, met)
+    return Outcome(replay.scene.log, runs, rows, appraisals)
 
 
 class _Judge:
@@ -274,18 +293,30 @@ class _Judge:
         return appraisal, None if self._foreseeing is None else self._foreseeing.result(self._runs)
 
 
-def _by_truth_id(
-    replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None, met: Bool
-) -> dict[str, Events]:
-    """Detections of the configurations that have truth ids: they need no states, only who was listed.
+def _in_sight(replay: Replay, experiment: Experiment, equipped: Bool | None, there: Bool | None) -> dict[str, Float]:
+    """By configuration when any of its units first has each look in sight: (S | 1, M)."""
+    equipped = equipped if there is None else there[None]
+    fleet = fleet_of(experiment, replay.scene).experiment
+    return {
+        name: in_sight_s(replay.first_sights_s, fleet, configuration, equipped)
+        for name, configuration in fleet.configurations.items()
+    }
 
-    Whose PEM's conditions are met is added to `met`.
-    """
+
+def _by_truth_id(
+    replay: Replay,
+    experiment: Experiment,
+    runs: Int,
+    equipped: Bool | None,
+    there: Bool | None,
+    sight_s: dict[str, Float],
+) -> dict[str, Events]:
+    """Detections of the configurations that have truth ids: they need no states, only who was listed."""
     units = fleet_of(experiment, replay.scene).experiment
     chosen = {name: c for name, c in units.configurations.items() if by_truth(c)}
     if not chosen:
         return {}
-    seen = _sightings(replay, units, runs, equipped, met)
+    seen = _sightings(replay, units, runs, equipped)
     events: dict[str, Events] = {}
     for name, configuration in chosen.items():
         heard = listen(seen, replay.truth, units, configuration, there)
@@ -296,17 +327,15 @@ def _by_truth_id(
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
         )
-        events[name] = Events(heard.units, result)
+        events[name] = Events(heard.units, result, sight_s[name])
     return events
 
 
-def _sightings(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, met: Bool) -> Tracks:
+def _sightings(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None) -> Tracks:
     """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
     pieces = []
     for stretch in replay.stretches:
-        found = replay.found(stretch)
-        met |= found.ever_met
-        found = replay.measured if stretch == WHOLE else found.of_objects(replay.looks.object_ix)
+        found = replay.measured if stretch == WHOLE else replay.found(stretch).of_objects(replay.looks.object_ix)
         recorded = None
         if replay.recorded is not None:
             recorded = replay.recorded.captured_between(stretch.from_s, stretch.until_s)

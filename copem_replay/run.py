@@ -65,9 +65,7 @@ def run(
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
-    notes += [
-        f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment, _met(parts, replay))
-    ]
+    notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
     notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     accuracy = None
@@ -151,16 +149,10 @@ def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:
     return count / span_s if span_s > 0 else None
 
 
-def _met(parts: Sequence[Outcome], replay: Replay) -> NDArray[np.bool_]:
-    """(U,) whether any object ever met a condition of each unit's PEM."""
-    met: NDArray[np.bool_] = np.any([part.met for part in parts if part.log == replay.scene.log], axis=0)
-    return met
-
-
-def _notes(replay: Replay, experiment: Experiment, met: NDArray[np.bool_]) -> list[str]:
+def _notes(replay: Replay, experiment: Experiment) -> list[str]:
     """What is odd about a log and an experiment together."""
     notes = list(replay.placed.notes)
-    for (name, unit), ever_met in zip(replay.fleet.experiment.modelled.items(), met, strict=True):
+    for (name, unit), ever_met in zip(replay.fleet.experiment.modelled.items(), replay.ever_met, strict=True):
         if not replay.placed.poses[name].present.any():
             notes.append(f"unit {name}: makes no list, its carrier is never there")
         elif not ever_met:

@@ -22,9 +22,7 @@ def summary_text(summary: pd.DataFrame) -> str:
     lines += _over(summary, "interval")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
-        lines.append(
-            f"ttd_rmst_s: mean time to detection, never detected counting as {_cell(float(horizon.iloc[0]))} s"
-        )
+        lines.append(f"ttd_rmst_s: mean time to detection, never detected counting as {cell(float(horizon.iloc[0]))} s")
     if "conflict_detected_share" in summary:
         names = [name for name in summary if name.startswith("conflict_")]
         lines += ["", as_text(summary[["configuration", *names]])]
@@ -42,7 +40,7 @@ def summary_text(summary: pd.DataFrame) -> str:
 
 def _intervals(summary: pd.DataFrame, of: str) -> list[str]:
     limits = zip(summary[f"{of}_low"], summary[f"{of}_high"], strict=True)
-    return [f"[{_cell(low)}, {_cell(high)}]" if pd.notna(low) else "–" for low, high in limits]
+    return [f"[{cell(low)}, {cell(high)}]" if pd.notna(low) else "–" for low, high in limits]
 
 
 def _over(summary: pd.DataFrame, name: str) -> list[str]:
@@ -52,7 +50,7 @@ def _over(summary: pd.DataFrame, name: str) -> list[str]:
 
 def as_text(table: pd.DataFrame) -> str:
     """A table with aligned columns; numbers to four significant digits, nulls as a dash."""
-    cells = [[_cell(value) for value in row] for row in table.itertuples(index=False)]
+    cells = [[cell(value) for value in row] for row in table.itertuples(index=False)]
     columns = list(zip(list(table.columns), *cells, strict=True))
     widths = [max(len(text) for text in column) for column in columns]
     left = [not pd.api.types.is_numeric_dtype(table[name]) for name in table.columns]
@@ -67,7 +65,8 @@ def as_text(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def _cell(value: object) -> str:
+def cell(value: object) -> str:
+    """A number to four significant digits, a null as a dash, anything else as it is."""
     if value is None or value is pd.NA or value != value:
         return "–"
     if not isinstance(value, float):

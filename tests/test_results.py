@@ -37,6 +37,7 @@ COLUMNS = {
     "detected": pa.bool_(),
     "detection_s": pa.float64(),
     "captured_s": pa.float64(),
+    "in_sight_s": pa.float64(),
     "time_to_detection_s": pa.float64(),
     "distance_at_detection_m": pa.float64(),
     "gap_at_detection_m": pa.float64(),

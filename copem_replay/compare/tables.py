@@ -16,13 +16,13 @@ from copem_replay.table import as_text
 
 _SUFFIXES = (".csv", ".md")
 _RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
-_NOTHING = 1e-9
+NOTHING = 1e-9
 """Closer to 0 than this is 0 (chosen: below what any of the metrics is measured with)."""
 
 
 def comparison_text(comparison: Comparison) -> str:
     """A row per configuration, a column per metric, and what they are; for a terminal or a pipe."""
-    return "\n".join([as_text(_cells(comparison)), *_lines(comparison)])
+    return "\n".join([as_text(_cells(comparison)), *comparison_lines(comparison)])
 
 
 def comparison_markdown(comparison: Comparison) -> str:
@@ -31,7 +31,7 @@ def comparison_markdown(comparison: Comparison) -> str:
     notes = (f"note: {note}" for note in comparison.notes)
     rows = [list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)]
     lines = ["| " + " | ".join(_escaped(str(cell)) for cell in row) + " |" for row in rows]
-    return "\n".join([*lines, "", *(f"- {_escaped(line)}" for line in (*_lines(comparison), *notes)), ""])
+    return "\n".join([*lines, "", *(f"- {_escaped(line)}" for line in (*comparison_lines(comparison), *notes)), ""])
 
 
 def check_out(path: Path) -> None:
@@ -68,20 +68,22 @@ def _cell(row: Any) -> str:
     if row is None or pd.isna(row.difference):
         return "–"
     if pd.isna(row.interval_over):
-        return _signed(row.difference)
-    low, high = ("–" if pd.isna(limit) else _plain(limit) for limit in (row.low, row.high))
-    return f"{_signed(row.difference)} [{low}, {high}]"
+        return signed(row.difference)
+    low, high = ("–" if pd.isna(limit) else plain(limit) for limit in (row.low, row.high))
+    return f"{signed(row.difference)} [{low}, {high}]"
 
 
-def _signed(value: float) -> str:
-    return "±0" if abs(value) < _NOTHING else ("+" if value > 0 else "") + _plain(value)
+def signed(value: float) -> str:
+    """A difference to three significant digits, with its sign."""
+    return "±0" if abs(value) < NOTHING else ("+" if value > 0 else "") + plain(value)
 
 
-def _plain(value: float) -> str:
-    return "0" if abs(value) < _NOTHING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+def plain(value: float) -> str:
+    """A limit to three significant digits."""
+    return "0" if abs(value) < NOTHING else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def _lines(comparison: Comparison) -> Iterator[str]:
+def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """What the table shows, and who is better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
@@ -101,7 +103,7 @@ def _lines(comparison: Comparison) -> Iterator[str]:
         )
     for metric, better in METRICS.items():
         of = overall[overall["metric"] == metric]
-        beyond = of["low"] > _NOTHING if better > 0 else of["high"] < -_NOTHING
+        beyond = of["low"] > NOTHING if better > 0 else of["high"] < -NOTHING
         if beyond.any():
             names = ", ".join(of.loc[beyond, "configuration"])
             yield f"better than {comparison.baseline} in {metric}, the interval excluding 0: {names}"

@@ -64,8 +64,8 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     for name in names:
         rows = results.table["configuration"] == name
         banded = over is not None and len(names) <= MOST_BANDS
-        curves[name] = _curve(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
-    exact = {name: _exact(results.exact, name) for name in names} if results.exact is not None else {}
+        curves[name] = curve_of(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
+    exact = {name: exact_curve(results.exact, name) for name in names} if results.exact is not None else {}
     with style():
         figure = _drawn(results, curves, exact)
         _note(figure, results, names, over, curves, bool(exact))
@@ -81,7 +81,8 @@ def endings(rows: pd.DataFrame) -> tuple[Float, Int]:
     return time_s, np.where(detected, DETECTED, np.where(left, LEFT, CENSORED))
 
 
-def _curve(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Curve:
+def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Curve:
+    """The curve of one configuration's rows (n,), with a band where it is said which cluster each row is of."""
     if not len(rows):
         return Curve(np.empty(0), np.empty(0))
     time_s, ending = endings(rows)
@@ -95,7 +96,7 @@ def _curve(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Curve:
     return Curve(times_s, share, low[held], high[held])
 
 
-def _exact(exact: pd.DataFrame, name: str) -> Curve:
+def exact_curve(exact: pd.DataFrame, name: str) -> Curve:
     """The probability of being detected by then, every log and object counting the same.
 
     Not the estimator of the runs' curves, which hands the weight of who is censored on to all who remain: be it a
@@ -111,10 +112,7 @@ def _exact(exact: pd.DataFrame, name: str) -> Curve:
 def _drawn(results: Results, curves: dict[str, Curve], exact: dict[str, Curve]) -> Figure:
     looks = appearances(tuple(results.experiment.configurations))
     short = short_names(list(curves))
-    begin_s = min([0.0, *(float(curve.times_s[0]) for curve in curves.values() if len(curve.times_s))])
-    end_s = max(curve.nearly_s() for curve in [*curves.values(), *exact.values()])
-    end_s += 0.12 * (end_s - begin_s) or 1.0
-    begin_s -= 0.03 * (end_s - begin_s)
+    begin_s, end_s = time_axis([*curves.values(), *exact.values()])
     figure = new_figure(8.0, 4.5)
     axes = figure.subplots()
     handles: list[Any] = []
@@ -145,6 +143,14 @@ def _drawn(results: Results, curves: dict[str, Curve], exact: dict[str, Curve]) 
         handlelength=3.6,
     )
     return figure
+
+
+def time_axis(curves: Sequence[Curve]) -> tuple[float, float]:
+    """From before the first detection until each curve has come near to its last value."""
+    begin_s = min([0.0, *(float(curve.times_s[0]) for curve in curves if len(curve.times_s))])
+    end_s = max(curve.nearly_s() for curve in curves)
+    end_s += 0.12 * (end_s - begin_s) or 1.0
+    return begin_s - 0.03 * (end_s - begin_s), end_s
 
 
 def _step(axes: Axes, curve: Curve, begin_s: float, end_s: float, **line: Any) -> list[Any]:

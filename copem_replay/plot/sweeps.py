@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _BEYOND_S = 1e9
 """Stands for never where a band is drawn: above every axis (chosen)."""
-_AXES = {
+AXES = {
     "latency_s": "Latency (s)",
     "rate_hz": "Rate of the units (lists per second)",
     "units": "Number of units",
@@ -138,7 +138,7 @@ def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
         axes.set_xticks(values, [f"{value:g}" for value in values], minor=False)
     if kind == "share":
         axes.xaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
-    axes.set_xlabel(_AXES.get(kind, kind))
+    axes.set_xlabel(AXES.get(kind, kind))
 
 
 def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -148,7 +148,7 @@ def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Se
     for kind in kinds:
         if kind != "rate_hz":
             rates = list_rates(sweep[sweep["sweep"] == kind], names)
-            said.append(f"{_AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else "")
+            said.append(f"{AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else "")
     over = sorted(set(sweep["interval_over"].dropna())) if "interval_over" in sweep else []
     interval = sorted(set(sweep["interval"].dropna())) if "interval" in sweep else []
     said.append(

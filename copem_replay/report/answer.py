@@ -1,0 +1,234 @@
+"""The answer in words: who wins, by how much, how sure that is, and what cannot be said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pandas as pd
+
+from copem_replay.compare import Comparison
+from copem_replay.compare.tables import NOTHING, plain, signed
+from copem_replay.plot.captions import percent
+from copem_replay.report.described import some
+from copem_replay.report.markup import Html, joined, listed, tag
+from copem_replay.report.study import RANKED_BY, Study
+from copem_replay.summary import FEWEST_CLUSTERS
+from copem_replay.table import cell
+from copem_replay.wording import counted
+
+
+def answer(study: Study) -> Html:
+    """All sentences, the most important one first."""
+    if study.best is None:
+        return joined(
+            [
+                tag("p", "There is no answer: no measured object has an onset, so nobody was measured.", class_="lead"),
+                listed(str(note) for note in study.provenance.get("notes", [])),
+            ]
+        )
+    first, *others = _sentences(study)
+    return joined([tag("p", first, class_="lead"), listed(others)])
+
+
+def _sentences(study: Study) -> Iterator[str]:
+    rows = study.results.summary.set_index("configuration")
+    contenders = study.contenders
+    share = rows["detected_share"].astype(float)
+    if (share[list(study.names)] == 0).all():
+        yield "Nothing was detected: no configuration came to know of any measured object in any run."
+    elif (share[list(contenders)] == 0).all():
+        yield "Nothing was detected but by the truth itself: no other configuration came to know of anybody in any run."
+    else:
+        yield _soonest(study)
+        yield from _others(study)
+        yield from _against_baseline(study)
+        yield from _detected(study, share)
+    yield from _passes(study)
+    yield from _accuracy(study)
+    yield from _truth(study)
+    yield _how_sure(study)
+    yield from _left_out(study)
+
+
+def _soonest(study: Study) -> Html:
+    assert study.best is not None
+    mean_s, horizon_s = (float(study.of(study.best)[key]) for key in (RANKED_BY, "ttd_rmst_horizon_s"))
+    counted_as = f"never detected counting as {cell(horizon_s)} s"
+    name = tag("b", study.best)
+    if study.lead is None:
+        alone = "it is the only configuration" if len(study.names) == 1 else "only the truth stands beside it"
+        return joined([name, f" knew after {cell(mean_s)} s on the average ({counted_as}). There is nothing to compare "
+                       f"it with: {alone}."])  # fmt: skip
+    later, alike, sooner, _ = _told_apart(study.lead)
+    undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
+    whom = f"the other {others}" if others > 1 else study.lead.configurations[0]
+    has, sure = f" has the shortest mean time, {cell(mean_s)} s", "; how sure that is, no interval tells"
+    if len(later) == others:
+        has, sure = f" knew soonest, after {cell(mean_s)} s on the average", f", sooner than {whom}"
+    elif undecided:
+        sure = f", but cannot be told from {f'{undecided} of ' if undecided < others else ''}{whom}"
+    return joined([name, f"{has} ({counted_as}){sure}."])
+
+
+def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Differences to the best: that are later, cannot be told from none, are sooner, and have no interval."""
+    rows = _of(lead, RANKED_BY)
+    rows = rows[rows["difference"].notna()].sort_values("difference", kind="stable")
+    unsure = rows["interval_over"].isna() | rows["low"].isna() | rows["high"].isna()
+    later = ~unsure & (rows["low"] > NOTHING)
+    sooner = ~unsure & (rows["high"] < -NOTHING)
+    return rows[later], rows[~unsure & ~later & ~sooner], rows[sooner], rows[unsure]
+
+
+def _others(study: Study) -> Iterator[str]:
+    """The others by whether their difference to the best can be told from none."""
+    if study.lead is None:
+        return
+    later, alike, sooner, unsure = _told_apart(study.lead)
+    if len(later):
+        yield f"Later than that, the interval of the difference excluding 0: {_each(later)}."
+    if len(alike):
+        yield (
+            f"No difference to it can be shown, the interval including 0: {_each(alike)}. That is not to say that "
+            "there is none."
+        )
+    if len(sooner):  # by pairs a mean over censored times may rank the other way round
+        yield f"Sooner by pairs, though later in the table: {_each(sooner)}."
+    if len(unsure):
+        yield f"After it, by differences without an interval: {_each(unsure)}."
+    if len(later) and len(study.contenders) > 2:
+        yield "The winner was picked by these same figures, which flatters it a little."
+
+
+def _each(rows: pd.DataFrame) -> str:
+    return some([f"{row.configuration} ({_difference(row)})" for row in rows.itertuples(index=False)])
+
+
+def _difference(row: Any, unit: str = " s") -> str:
+    shown = f"{signed(row.difference)}{unit}"
+    if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
+        return shown
+    return f"{shown} [{plain(row.low)}, {plain(row.high)}]"
+
+
+def _against_baseline(study: Study) -> Iterator[str]:
+    if study.regret is None or study.baseline in study.contenders:  # among whom it is said already
+        return
+    row = _of(study.regret, RANKED_BY).set_index("configuration").loc[study.best]
+    if pd.isna(row["difference"]):
+        return
+    yield f"{study.best} against {study.baseline}, the baseline: {_difference(row)} in the mean time{_unsure(row)}."
+
+
+def _unsure(row: Any) -> str:
+    if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
+        return ", without an interval"
+    if row.low <= NOTHING and row.high >= -NOTHING:
+        return ": the interval includes 0, so no difference can be shown"
+    return ""
+
+
+def _detected(study: Study, share: pd.Series) -> Iterator[str]:
+    never = [name for name in study.contenders if share[name] == 0]
+    if never:
+        yield f"Never knew of anybody: {some(never)}."
+    if (share[list(study.contenders)] == 1).all():
+        yield "Everybody was detected in every run, in every configuration."
+        return
+    missed = [(name, 1 - float(share[name])) for name in study.contenders if 0 < share[name] < 1]
+    if missed:
+        worst, least = max(missed, key=lambda one: one[1]), min(missed, key=lambda one: one[1])
+        rows = "of the rows (objects × runs) never detected"
+        if percent(worst[1]) == percent(least[1]):
+            whom = some([name for name, _ in missed])
+            yield f"{whom}: {'each ' if len(missed) > 1 else ''}{percent(worst[1])} {rows}. Who that is, is said below."
+        else:
+            yield (
+                f"{len(missed)} configurations missed somebody, from {least[0]} with {percent(least[1])} to {worst[0]} "
+                f"with {percent(worst[1])} {rows}. Who that is, is said below."
+            )
+
+
+def _passes(study: Study) -> Iterator[str]:
+    rows = study.results.summary.set_index("configuration")
+    if "pass_share" not in rows:
+        return
+    judged = rows.loc[[name for name in study.contenders if pd.notna(rows.loc[name, "pass_share"])]]
+    if not len(judged):
+        yield "Braking: nobody is in conflict with the ego, so there is nothing to judge."
+        return
+    share = judged["pass_share"].astype(float)
+    best, worst = str(share.idxmax()), str(share.idxmin())
+    alike = [str(name) for name in share.index[share == share[best]]]
+    said = f"Braking: of {counted(int(judged.loc[best, 'n_conflict']), 'row')} in conflict "
+    said += f"{_share(judged.loc[best])} pass with {some(alike)}"
+    if len(alike) < len(share):
+        said += f", {_share(judged.loc[worst])} with {worst}"
+    if study.regret is not None and best != study.baseline:
+        found = _of(study.regret, "pass_share").set_index("configuration")
+        if best in found.index and pd.notna(found.loc[best, "difference"]):
+            row = found.loc[best]
+            points = row.copy()
+            points[["difference", "low", "high"]] = 100 * row[["difference", "low", "high"]].astype(float)
+            said += f"; {best} against {study.baseline} {_difference(points, ' percentage points')}{_unsure(points)}"
+    yield said + "."
+
+
+def _share(row: Any) -> str:
+    low, high = row["pass_share_low"], row["pass_share_high"]
+    shown = percent(float(row["pass_share"]))
+    return shown if pd.isna(low) else f"{shown} [{percent(float(low))}, {percent(float(high))}]"
+
+
+def _accuracy(study: Study) -> Iterator[str]:
+    rows = study.results.summary.set_index("configuration")
+    if "gospa_m" not in rows:
+        return
+    known = rows.loc[list(study.contenders), "gospa_m"].dropna().astype(float)
+    if len(known) > 1 and known.min() < known.max():
+        best, worst = str(known.idxmin()), str(known.idxmax())
+        yield (
+            f"The best lists, places, misses and false entries taken together, had {best}: GOSPA "
+            f"{cell(known[best])} m, against {cell(known[worst])} m with {worst}."
+        )
+
+
+def _truth(study: Study) -> Iterator[str]:
+    truth = [name for name in study.names if name not in study.contenders]
+    if truth:
+        yield f"{', '.join(truth)}: the truth itself, what could be had at best; no contender."
+
+
+def _how_sure(study: Study) -> str:
+    over = study.results.summary["interval_over"].dropna()
+    if not len(over):
+        return (
+            f"How sure: there are no intervals, for there are fewer than {FEWEST_CLUSTERS} logs and fewer than "
+            f"{FEWEST_CLUSTERS} measured objects. What is said holds for these objects; more runs would not tell about "
+            "other traffic."
+        )
+    tells = {
+        "runs": "how far other draws of the same models might differ, for this one object in this one log; they do not "
+        "tell about other traffic",
+        "objects": "how far other objects in traffic of this kind might differ",
+        "logs": "how far other recordings of this kind might differ",
+    }[str(over.iloc[0])]
+    return (
+        f"How sure: intervals are 95 %, in brackets, over {over.iloc[0]}. They say {tells}. Where all are alike an "
+        "interval is a point, which is no certainty."
+    )
+
+
+def _left_out(study: Study) -> Iterator[str]:
+    skipped = [str(log["log"]) for log in study.provenance.get("logs_skipped", [])]
+    if skipped:
+        yield f"In no figure, for it could not be replayed: {some(skipped)}."
+    notes = study.provenance.get("notes", [])
+    if notes:
+        yield f"{counted(len(notes), 'note')} on recordings and experiment: see Notes."
+
+
+def _of(comparison: Comparison, metric: str) -> pd.DataFrame:
+    overall = comparison.overall
+    return overall[overall["metric"] == metric]

@@ -1,0 +1,77 @@
+"""Who was never detected, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+
+from copem_replay.report.markup import Html, joined, table, tag
+from copem_replay.report.study import Study
+from copem_replay.table import cell
+from copem_replay.wording import counted
+
+_OPEN = 40
+"""Rows up to which the table is shown at once (chosen)."""
+_ENDINGS = {"object_left": "it left", "ego_left": "the ego left", "log_end": "the log ended"}
+
+
+def never_detected(study: Study) -> Html:
+    """A row for each object and each set of configurations that missed it in as many runs, the most missed first."""
+    table_of = study.results.table
+    missed = misses(table_of)
+    if not len(missed):
+        return tag("p", "None: every measured object was detected in every run, by every configuration.")
+    rows = [_row(study, found, list(names)) for found, names in _together(missed, study.names)]
+    things = missed.groupby(["log", "object_id"]).ngroups
+    every = table_of.groupby(["log", "object_id"]).ngroups
+    said = (
+        f"{counted(things, 'object')} of the {every} measured, missed in some run by some configuration; most often "
+        "missed first. A row names all configurations that missed the object in as many runs."
+    )
+    head = ["log", "object", "class", "never in", "by", "looked at for (s)", "until"]
+    whole = table(head, rows, caption="Objects never detected", id_="never")
+    if len(rows) > _OPEN:
+        whole = tag("details", tag("summary", f"All {len(rows)} rows"), whole)
+    return joined([tag("p", said), whole])
+
+
+def misses(rows: pd.DataFrame) -> pd.DataFrame:
+    """By log, object and configuration in how many runs it was never detected (`missed`), of how many (`runs`)."""
+    keys = ["log", "object_id", "configuration"]
+    grouped = rows.assign(missed=~rows["detected"].astype(bool)).groupby(keys, sort=False)
+    found = grouped.agg(
+        missed=("missed", "sum"),
+        runs=("missed", "size"),
+        object_class=("object_class", "first"),
+        onset_s=("onset_s", "first"),
+        ended_s=("ended_s", "first"),
+        ended_by=("ended_by", "first"),
+    ).reset_index()
+    return found[found["missed"] > 0]
+
+
+def _together(missed: pd.DataFrame, order: Sequence[str]) -> list[tuple[pd.Series, tuple[str, ...]]]:
+    by_key: dict[tuple[str, str, int, int], tuple[pd.Series, list[str]]] = {}
+    for _, found in missed.iterrows():
+        key = (str(found["log"]), str(found["object_id"]), int(found["missed"]), int(found["runs"]))
+        by_key.setdefault(key, (found, []))[1].append(str(found["configuration"]))
+    ranked = sorted(by_key, key=lambda key: (-key[2] / key[3], -len(by_key[key][1]), key))
+    return [(by_key[key][0], tuple(name for name in order if name in by_key[key][1])) for key in ranked]
+
+
+def _row(study: Study, found: pd.Series, names: list[str]) -> Html:
+    every = len(names) == len(study.names) > 1
+    by = f"all {len(names)} configurations" if every else ", ".join(names)
+    return tag(
+        "tr",
+        tag("th", str(found["log"]), scope="row"),
+        tag("td", str(found["object_id"]), class_="text"),
+        tag("td", str(found["object_class"]), class_="text"),
+        tag("td", f"{counted(int(found['runs']), 'run') if found['missed'] == found['runs'] else found['missed']}"
+            + (" (all)" if found["missed"] == found["runs"] else f" of {counted(int(found['runs']), 'run')}"),
+            data_value=str(found["missed"])),
+        tag("td", by, class_="text long"),
+        tag("td", cell(float(found["ended_s"] - found["onset_s"]))),
+        tag("td", _ENDINGS.get(str(found["ended_by"]), str(found["ended_by"])), class_="text"),
+    )  # fmt: skip
