@@ -35,12 +35,13 @@ class Foreseeing:
         self._ego, self._found, self._wanted, self._confirm = ego, found, wanted, confirm
         never = np.full(len(found.object_ix), -np.inf)
         self._not_before_s = never if count_earlier else found.onset_s - _TOLERANCE_S
-        self._lists, self._issue_s = 0, [np.empty(0)]
+        self._lists, self._runs, self._issue_s = 0, 1, [np.empty(0)]
         self._held: dict[tuple[int, int], list[Int]] = {}  # by run and look: lists that imply one
 
     def add(self, belief: Belief, first_run: int = 0) -> None:
         """Take in what is believed in runs (S,), `first_run` and those that follow; several of one stretch may be."""
         fused = belief.fused
+        self._runs = max(self._runs, first_run + len(fused.valid))
         issue_s = fused.arrives_s[0]
         pieces, bounds = corridors(self._ego, issue_s, self._wanted)
         implied = np.zeros(fused.valid.shape, dtype=np.bool_)
@@ -64,10 +65,10 @@ class Foreseeing:
         self._issue_s.append(issue_s)
         self._lists += len(issue_s)
 
-    def result(self, runs: int) -> Float:
-        """(S, M) when that was; NaN: never."""
+    def result(self) -> Float:
+        """(S, M) when that was, in one run where one stands for all; NaN: never."""
         issue_s = np.concatenate(self._issue_s)
-        first_s = np.full((runs, len(self._found.object_ix)), np.nan)
+        first_s = np.full((self._runs, len(self._found.object_ix)), np.nan)
         hits, of = self._confirm.hits, self._confirm.of
         for (s, m), parts in self._held.items():
             held = np.concatenate(parts)

@@ -290,7 +290,7 @@ class _Judge:
 
     def result(self) -> tuple[Appraisal | None, Float | None]:
         appraisal = None if self._appraiser is None else self._appraiser.result(self._runs)
-        return appraisal, None if self._foreseeing is None else self._foreseeing.result(self._runs)
+        return appraisal, None if self._foreseeing is None else self._foreseeing.result()
 
 
 def _in_sight(replay: Replay, experiment: Experiment, equipped: Bool | None, there: Bool | None) -> dict[str, Float]:

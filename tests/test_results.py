@@ -22,6 +22,7 @@ from copem_replay.experiment import Experiment
 from copem_replay.results import write_results
 from copem_replay.run import Result, run
 from copem_replay.shown import shown_logs, shown_runs
+from copem_replay.stretches import WHOLE
 from copem_replay.write import RUN_RECORD
 from recordings import Obj, write_recording
 from scenes import experiment
@@ -330,7 +331,7 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
         measure = {"onset": {"kind": "appears"}, "objects": {"ids": ["a"]}, "accuracy": accuracy}
         many = experiment(runs=100, measure=measure, pems={"sure": NOISY})
         ready = replays.prepare(log, many)
-        candidates = ready.found if accuracy else ready.measured
+        candidates = ready.found(WHOLE) if accuracy else ready.measured
         rows = len(candidates.tracks.frame_ix)
         assert rows == (62 if accuracy else 31)
         whole = run(many, [log])
