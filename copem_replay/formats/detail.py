@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.fusion.belief import Belief
 from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Bool, Scene
+
+if TYPE_CHECKING:
+    from copem_replay.fusion.belief import Belief
 
 SCHEMA = "copem_replay.ListDetail"
 Event = Mapping[str, Any]

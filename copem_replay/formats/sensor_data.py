@@ -8,13 +8,14 @@ virtual sensor's). `base_rmse` holds standard deviations. `ground_truth_id` is t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.chance import object_words
-from copem_replay.fusion.belief import Belief
 from copem_replay.tracks import CLASSES, NO_CAPTURE_NS, VALUES, Float, Scene
+
+if TYPE_CHECKING:
+    from copem_replay.fusion.belief import Belief
 
 SCHEMA = "osi3.SensorData"
 OSI_VERSION = (3, 8, 0)
@@ -39,7 +40,11 @@ _MEASURED, _STALE = 2, 1  # osi_detectedobject.proto: MEASUREMENT_STATE_MEASURED
 def osi_id(object_id: str) -> int:
     """The number OSI has for an object: its id where that is a number, else a stable hash of it."""
     number = object_id.removeprefix("stationary:")
-    return int(number) if number.isdigit() and int(number) < 2**64 else int(object_words([object_id])[0])
+    if number.isdigit() and int(number) < 2**64:
+        return int(number)
+    from copem_replay.chance import object_words  # compiled: a look at lists whose ids are numbers does without
+
+    return int(object_words([object_id])[0])
 
 
 def message_class() -> Any:
