@@ -444,6 +444,20 @@ class TestFile:
         assert made == '<td class="x&quot;y" hidden>a&lt;b&gt;&amp;&quot;&#x27;<i></i></td>'
         assert tag("p", "a\nb\x1b\u202e") == "<p>a\\nb\\x1b\\u202e</p>"
 
+    def test_another_summary_is_refused(self, mine: Path) -> None:
+        text = (mine / "summary.csv").read_text(encoding="utf-8")
+        for damaged, said in (
+            (text.replace("ttd_rmst_s,", "ttd_mean_s,"), "expected the column ttd_rmst_s, found none"),
+            (text.replace("pass_share_low", "low"), "expected the column pass_share_low, found none"),
+            (
+                text.replace("\nhit,", "\nhits,"),
+                "expected rows of GT, late, half, hit, never, found GT, late, half, hits",
+            ),
+        ):
+            (mine / "summary.csv").write_text(damaged, encoding="utf-8")
+            with pytest.raises(InputError, match=said):
+                write_report(mine)
+
     def test_nothing_half_written(self, mine: Path, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("a file")
         for out in (tmp_path / "report.pdf", tmp_path / "file" / "report.html", mine):

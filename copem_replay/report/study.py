@@ -17,6 +17,10 @@ from copem_replay.plot.appearance import Appearance, appearances
 from copem_replay.plot.folder import Results, load_results
 from copem_replay.references import unknown
 
+_COLUMNS = (
+    "detected_share", "interval", "interval_over", "ttd_median_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
+)  # fmt: skip
+_BRAKING = ("n_conflict", "pass_share", "pass_share_low", "pass_share_high", "pass_interval", "pass_interval_over")
 RANKED_BY = "ttd_rmst_s"
 """Who knows soonest: the mean that counts those who were never detected, too."""
 
@@ -63,6 +67,7 @@ def load_study(folder: Path, baseline: str | None = None) -> Study:
     """
     results = load_results(folder, rowless=True)
     provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    _check_summary(results)
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:
         raise InputError(f"--baseline: {unknown('configuration', baseline, names)}")
@@ -82,6 +87,17 @@ def load_study(folder: Path, baseline: str | None = None) -> Study:
             else compare([folder], configurations=contenders, baseline=best)
         )
     return Study(results, provenance, against, regret, best, lead)
+
+
+def _check_summary(results: Results) -> None:
+    """Raise InputError where `summary.csv` is not that of the experiment."""
+    place, again = results.folder / "summary.csv", "run the experiment again with --overwrite"
+    needed = _COLUMNS + (_BRAKING if results.experiment.braking is not None else ())
+    if missing := [name for name in needed if name not in results.summary]:
+        raise InputError(f"{place}: expected the column {missing[0]}, found none; {again}")
+    expected, found = list(results.experiment.configurations), list(results.summary["configuration"])
+    if found != expected:
+        raise InputError(f"{place}: expected rows of {', '.join(expected)}, found {', '.join(found)}; {again}")
 
 
 def _contenders(results: Results) -> tuple[str, ...]:
