@@ -78,8 +78,12 @@ def write_results(
     *,
     skipped: Sequence[tuple[Path, str]] = (),
     overwrite: bool = False,
+    viewer: str | None = None,
 ) -> list[str]:
-    """Write the folder of the contract. Returns what has to be said of it. Raises OutputError."""
+    """Write the folder of the contract. Returns what has to be said of it. Raises OutputError.
+
+    `viewer`: where a Rerun viewer listens that shall get what is written to .rrd, too.
+    """
     check_target(folder, overwrite=overwrite, inputs=[recording.path for recording in recordings])
     folder = folder.resolve()
     try:
@@ -89,7 +93,7 @@ def write_results(
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
         scratch.chmod(0o777 & ~_umask())
-        notes = _fill(scratch, folder, experiment, recordings, result, skipped)
+        notes = _fill(scratch, folder, experiment, recordings, result, skipped, viewer)
         _replace(scratch, folder)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
@@ -100,7 +104,7 @@ def write_results(
 
 def _fill(
     scratch: Path, folder: Path, experiment: Experiment, recordings: Sequence[Recording], result: Result,
-    skipped: Sequence[tuple[Path, str]],
+    skipped: Sequence[tuple[Path, str]], viewer: str | None,
 ) -> list[str]:  # fmt: skip
     data = experiment.as_written()
     data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
@@ -116,14 +120,16 @@ def _fill(
     notes = list(result.notes)
     for log in shown_logs(experiment, result):
         target = scratch / "replay" if len(recordings) == 1 else scratch / "replay" / log
-        said = _show(target, log, experiment, recordings, result)
+        said = _show(target, log, experiment, recordings, result, viewer)
         notes += [f"{log}: {line}" for line in said]
     provenance = provenance_of(experiment, recordings, result, skipped, notes)
     (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return notes
 
 
-def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> list[str]:
+def _show(
+    target: Path, log: str, experiment: Experiment, recordings: Sequence[Recording], result: Result, viewer: str | None
+) -> list[str]:
     from copem_replay.families import family_of
     from copem_replay.show import write_rrd
     from copem_replay.write import write_mcap
@@ -149,16 +155,7 @@ def _show(target: Path, log: str, experiment: Experiment, recordings: Sequence[R
     said = write_mcap(
         Path(f"{target}.mcap"), recording.path, replay.scene, beliefs, rows, manifest, family_of(recording)
     )
-    write_rrd(
-        Path(f"{target}.rrd"),
-        replay,
-        alone,
-        beliefs,
-        rows,
-        summary,
-        number,
-    )
-    return said
+    return said + write_rrd(Path(f"{target}.rrd"), replay, alone, beliefs, rows, summary, number, viewer)
 
 
 def provenance_of(

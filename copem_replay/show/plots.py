@@ -7,10 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from copem_replay.appraise import settings_of
 from copem_replay.colours import TRUTH, Rgb
 from copem_replay.experiment import Experiment
+from copem_replay.fusion.belief import Belief
+from copem_replay.gospa import gospa
+from copem_replay.onset import measured_objects
 from copem_replay.replay import Replay
-from copem_replay.resample import states_at
+from copem_replay.resample import at_instants, states_at
 from copem_replay.show.out import Out, by_frame, elapsed_ns, part_of
 from copem_replay.show.world import EGO
 from copem_replay.tracks import Float, Int, Tracks
@@ -18,6 +22,9 @@ from copem_replay.units import carrier
 
 BY_EGO, BY_ANY = "ego", "any unit"
 """Whose share a curve is: the best of the ego's units, the best of all."""
+
+LISTS_AT_ONCE = 2_000
+"""For so many lists the truth is interpolated at a time (chosen)."""
 
 _LOOKS = {BY_EGO: (EGO, 3.0), BY_ANY: (TRUTH, 1.5)}
 
@@ -110,3 +117,39 @@ def known(out: Out, replay: Replay, beliefs: Mapping[str, Tracks], colours: Mapp
         out.columns(path, elapsed_ns(tracks)[rows], rr.Scalars.columns(scalars=counts[rows].astype(float)))
         until_next = rr.components.InterpolationMode.StepAfter
         out.static(path, rr.SeriesLines(names=name, colors=colour, widths=width, interpolation_mode=until_next))
+
+
+def gospa_of(replay: Replay, experiment: Experiment, belief: Belief) -> tuple[Int, Float]:
+    """GOSPA (m) of each list at the instant it is available: when (K,), and how much (K,).
+
+    Of the measured objects that are in the log then against the entries that are about one of them, and the ghosts of
+    their classes; cut-off and power as in `measure`.
+    """
+    scene, fused, measure = replay.scene, belief.fused, experiment.measure
+    settings = settings_of(measure, scene.end_s)
+    measured = np.isin(np.arange(len(scene.object_ids) + 1), measured_objects(scene, measure))  # the last: nobody
+    ghosts = replay.surroundings.classes(measure)[belief.class_of(scene)] & (fused.row_object_ix < 0)
+    truth = replay.truth.take_tracks(measured[replay.truth.object_ix])
+    rows, listed = by_frame(fused, fused.valid[0] & (measured[fused.row_object_ix] | ghosts))
+    elapsed, starts = elapsed_ns(fused), np.append(0, np.cumsum(listed))
+    value_m = np.empty(len(listed))
+    for first in range(0, len(listed), LISTS_AT_ONCE):
+        stamps = scene.t0_ns + elapsed[first : first + LISTS_AT_ONCE]
+        world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
+        order, bounds = world.by_frame
+        for f in range(len(stamps)):
+            there, said = order[bounds[f] : bounds[f + 1]], rows[starts[first + f] : starts[first + f + 1]]
+            both = (np.stack([t.x_m[0, r], t.y_m[0, r]], axis=-1) for t, r in ((world, there), (fused, said)))
+            value_m[first + f] = gospa(*both, cutoff_m=settings.cutoff_m, power=settings.power).value_m
+    return elapsed, value_m
+
+
+def gospas(out: Out, replay: Replay, experiment: Experiment, name: str, belief: Belief, colour: Rgb) -> None:
+    """The curve of one configuration."""
+    import rerun as rr
+
+    elapsed, value_m = gospa_of(replay, experiment, belief)
+    path = ["plots", "gospa", part_of(name)]
+    out.columns(path, elapsed, rr.Scalars.columns(scalars=value_m))
+    until_next = rr.components.InterpolationMode.StepAfter
+    out.static(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, interpolation_mode=until_next))
