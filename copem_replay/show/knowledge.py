@@ -71,7 +71,7 @@ def _told(scene: Scene, experiment: Experiment, seen: Sight, made: Status, rows:
     hidden = np.flatnonzero(status == HIDDEN)
     by = unit[hidden], frame[hidden], column[hidden]
     share, body = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
-    share[hidden], body[hidden] = seen.share[by], seen.body_ix[seen.blocker[by]]
+    share[hidden], body[hidden] = seen.share[by], seen.body_ix[by]
     time_s = np.nan_to_num(np.where(status == KNOWN, made.age_s[rows, column], made.until_s[rows, column]))
     near = seen.in_range[:, frame, column].any(axis=0)
     whole = [np.rint(value).astype(np.int64) for value in (time_s * 10, share * 100)]
@@ -107,7 +107,7 @@ def hiding(out: Out, name: str, seen: Sight, made: Status) -> None:
     if not len(rows):
         return
     by, frame = made.unit_ix[rows, column], made.frame[rows]
-    lines = np.stack([seen.place_m[by, frame], seen.centre_m[seen.blocker[by, frame, column]]], axis=1)
+    lines = np.stack([seen.place_m[by, frame], seen.body_m[by, frame, column]], axis=1)
     counts = np.bincount(rows, minlength=len(made.elapsed_ns))
     told = np.flatnonzero((counts > 0) | (np.append(0, counts[:-1]) > 0))  # none: once is enough
     path = ["world", part_of(name), "hiding"]

@@ -7,34 +7,35 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.experiment import Experiment
+from copem_replay.experiment import Experiment, Unit
 from copem_replay.pem.condition import Condition, Couple
 from copem_replay.pem.look import Look
 from copem_replay.replay import Replay
 from copem_replay.resample import at_instants, wrap
 from copem_replay.show.out import f32
-from copem_replay.tracks import Bool, Float, Int
+from copem_replay.tracks import Bool, Float, Int, Tracks
 from copem_replay.units import Poses, carrier, observers, poses, unit_ground
 from copem_replay.visibility import hidden_by, visible_shares
+
+CLEAR_ABOVE = 0.5
+"""Seen when more than this share of it is (chosen)."""
 
 
 @dataclass(frozen=True)
 class Sight:
     """At frames of the truth (K,), of objects (M,), from the experiment's units (U,), those that are modelled.
 
-    `share`: NaN outside the unit's field of view, where it is absent, or carried by the object. `blocker`: a row of
-    `centre_m (B, 3)` and of `body_ix (B,)`, an object or −1 − k for the obstacle k.
+    `share`: NaN outside the unit's field of view, where it is absent, or carried by the object. `body_ix`: of what is
+    not clearly seen the object that hides most of it, −1 − k: the obstacle k; `body_m` where that is.
     """
 
     elapsed_ns: Int
     object_ix: Int
-    there: Bool  # (K, M) whether the object is
     share: Float  # (U, K, M)
-    blocker: Int  # (U, K, M) −1: nothing hides it
     in_range: Bool  # (U, K, M)
+    body_ix: Int  # (U, K, M)
+    body_m: Float  # (U, K, M, 3)
     place_m: Float  # (U, K, 3) of the unit
-    centre_m: Float
-    body_ix: Int
 
 
 def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight:
@@ -42,46 +43,68 @@ def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight
     scene, truth = replay.scene, replay.truth
     stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
     world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    rows = np.flatnonzero(np.isin(world.row_object_ix, shown))
+    rows, column = _rows(world, shown)
     frame = world.frame_ix[rows]
-    column = np.searchsorted(np.sort(shown), world.row_object_ix[rows])
-    column = np.argsort(shown)[column] if len(rows) else column
     shape = (len(experiment.units), len(stamps), len(shown))
-    there = np.zeros(shape[1:], dtype=bool)
-    there[frame, column] = True
-    share, blocker, place = np.full(shape, np.nan), np.full(shape, -1), np.full((*shape[:2], 3), np.nan)
-    in_range, in_field = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    seen = Sight(
+        elapsed_ns=stamps - scene.t0_ns,
+        object_ix=np.array(shown, dtype=np.int64),
+        share=np.full(shape, np.nan),
+        in_range=np.zeros(shape, dtype=bool),
+        body_ix=np.zeros(shape, dtype=np.int64),
+        body_m=np.full((*shape, 3), np.nan),
+        place_m=np.full((*shape[:2], 3), np.nan),
+    )
+    obstacles = _obstacle_centres(replay, experiment)
     for u, (name, unit) in enumerate(experiment.units.items()):
         if unit.recorded is not None or not len(rows):
             continue
         at = poses(scene, unit, world, unit_ground(truth, name, unit, []))
         watching = observers([at], np.array([carrier(scene, unit)]))
-        flat = experiment.visibility == "flat"
-        share[u, frame, column] = visible_shares(world, replay.found.static, watching, flat=flat)[0, rows]
-        hides = hidden_by(world, replay.found.static, watching, flat=flat)[0, rows]
-        blocker[u, frame, column] = np.where(hides < -1, len(world.frame_ix) - 2 - hides, hides)
-        place[u] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
-        dx, dy = world.x_m[0, rows] - at.x_m[frame], world.y_m[0, rows] - at.y_m[frame]
-        look = _look(at, frame, dx, dy, scene.object_class[world.row_object_ix[rows]])
+        [share] = visible_shares(world, replay.found.static, watching, flat=experiment.visibility == "flat")
+        look = _look(at, world, rows, scene.object_class[world.row_object_ix[rows]])
         pem = experiment.pems[str(unit.pem)]
-        in_range[u, frame, column] = _anywhere(pem, look, "range_m")
-        in_field[u, frame, column] = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
-    obstacles = _obstacle_centres(replay, experiment)
-    return Sight(
-        elapsed_ns=stamps - scene.t0_ns,
-        object_ix=np.array(shown, dtype=np.int64),
-        there=there,
-        share=np.where(in_field, share, np.nan),
-        blocker=blocker,
-        in_range=in_range,
-        place_m=place,
-        centre_m=np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), obstacles]),
-        body_ix=np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))]),
-    )
+        in_field = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
+        seen.place_m[u] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
+        seen.in_range[u, frame, column] = _anywhere(pem, look, "range_m")
+        seen.share[u, frame, column] = np.where(in_field, share[rows], np.nan)
+        _hidden(replay, experiment, unit, at, seen, u, obstacles)
+    return seen
 
 
-def _look(at: Poses, frames: Int, dx: Float, dy: Float, class_ix: np.ndarray) -> Look:
+def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
+    """The rows of the shown objects, and which of them each is about."""
+    rows = np.flatnonzero(np.isin(world.row_object_ix, shown))
+    return rows, np.argsort(shown)[np.searchsorted(np.sort(shown), world.row_object_ix[rows])]
+
+
+def _hidden(
+    replay: Replay, experiment: Experiment, unit: Unit, at: Poses, seen: Sight, u: int, obstacles: np.ndarray
+) -> None:
+    """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`."""
+    frames = np.flatnonzero((seen.share[u] <= CLEAR_ABOVE).any(axis=1))
+    if not len(frames):
+        return
+    scene, gap_s = replay.scene, experiment.max_gap_s
+    world = at_instants(replay.truth, scene.t0_ns + seen.elapsed_ns[frames], t0_ns=scene.t0_ns, max_gap_s=gap_s)
+    then = Poses(*(getattr(at, name)[frames] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
+    watching = observers([then], np.array([carrier(scene, unit)]))
+    [hides] = hidden_by(world, replay.found.static, watching, flat=experiment.visibility == "flat")
+    rows, column = _rows(world, seen.object_ix.tolist())
+    kept = hides[rows] != -1  # nothing hides any of it
+    rows, column = rows[kept], column[kept]
+    count = len(world.frame_ix)
+    body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
+    whose = np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))])
+    where = np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), obstacles])
+    seen.body_ix[u, frames[world.frame_ix[rows]], column] = whose[body]
+    seen.body_m[u, frames[world.frame_ix[rows]], column] = where[body]
+
+
+def _look(at: Poses, world: Tracks, rows: Int, class_ix: np.ndarray) -> Look:
     """What fields of view ask: range, azimuth and class; of the rest nothing is said."""
+    frames = world.frame_ix[rows]
+    dx, dy = world.x_m[0, rows] - at.x_m[frames], world.y_m[0, rows] - at.y_m[frames]
     bearing = np.arctan2(dy, dx)
     nothing = np.full(len(dx), np.nan)
     rest = dict.fromkeys(Look.__dataclass_fields__, nothing)

@@ -25,11 +25,9 @@ from copem_replay.fusion.belief import Belief
 from copem_replay.replay import Replay
 from copem_replay.resample import states_at
 from copem_replay.show.out import elapsed_ns, ns
-from copem_replay.show.sight import Sight
+from copem_replay.show.sight import CLEAR_ABOVE, Sight
 from copem_replay.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Tracks
 
-CLEAR_ABOVE = 0.5
-"""Seen when more than this share of it is (chosen)."""
 STATUSES = ("absent", "not listed", "out of view", "hidden", "visible", "lost", "captured", "known")
 ABSENT, UNLISTED, OUT, HIDDEN, VISIBLE, LOST, CAPTURED, KNOWN = range(len(STATUSES))
 
