@@ -16,6 +16,8 @@ from copem_replay.units import carrier, moved
 
 FARTHEST_AHEAD_M = 12.0
 """So far ahead of whom it follows the eye looks at most (chosen: nobody drives out of the picture)."""
+AROUND_UNIT_M = 40.0
+"""Of ways past a fixed unit from which distances are measured so much is in view (chosen)."""
 FOLLOWED = ("world", "eye")
 TURNED_RAD, DOWN_RAD = np.deg2rad((65.0, 45.0))
 """The eye looks this far to the right of the ego's heading, and down (chosen)."""
@@ -67,10 +69,12 @@ def eye_on(replay: Replay, experiment: Experiment, table: pd.DataFrame, wide: fl
     place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
     named = experiment.units.get(experiment.measure.distance_to)
     if named is not None and named.at is not None:
-        place = np.concatenate([place, np.array([*named.at, truth.z_m.min(initial=0.0)])[:, None]], axis=1)
+        unit_at = np.array([*named.at, place[2].mean() if place.size else 0.0])[:, None]
+        near = np.hypot(*(place - unit_at)[:2]) <= AROUND_UNIT_M
+        place = np.concatenate([place[:, near if near.any() else slice(None)], unit_at], axis=1)
     if not place.size:
         return Eye(np.array([-30.0, 0.0, 30.0]), np.zeros(3), None)
-    target, towards = (place.min(axis=1) + place.max(axis=1)) / 2, _ahead(0.0)
+    target, towards = place.mean(axis=1), _ahead(0.0)
     eye = target - _distance(place - target[:, None], towards, NEAR_FAR_M, wide) * towards
     return Eye(np.round(eye, 1), np.round(target, 1), None)
 
