@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from copem_replay.believe import by_truth
-from copem_replay.colours import configuration_colours
+from copem_replay.colours import Rgb, configuration_colours
 from copem_replay.experiment import Experiment
 from copem_replay.fusion.belief import Belief
 from copem_replay.replay import Replay
@@ -54,6 +54,8 @@ def write_rrd(
     ids = f"copem_replay:{appearance}", digest(experiment.model_dump_json(), replay.scene.log, str(run))
     strict = rr.strict_mode()
     rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
+    every = configuration_colours(beliefs)  # as in the MCAP, which has all of them
+    colours = {name: every[name] for name in chosen}
     live = None
     try:
         with file_stream(path, *ids) as rec:
@@ -73,6 +75,7 @@ def write_rrd(
                 run,
                 shown,
                 left_out,
+                colours,
             )
     finally:
         rr.set_strict_mode(strict)
@@ -119,11 +122,11 @@ def telling(table: pd.DataFrame, baselines: Sequence[str], most: int) -> list[st
 def _fill(
     out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
     summary: pd.DataFrame, run: int, shown: Sequence[int], left_out: Sequence[str],
+    colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
     import rerun as rr
 
     scene = replay.scene
-    colours = configuration_colours(beliefs)
     _properties(out, replay, experiment, list(beliefs), run)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, world.names_and_colours(scene))
     words.differences(out, replay, table, shown, left_out)
