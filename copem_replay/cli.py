@@ -130,6 +130,10 @@ def run(
         bool, typer.Option("--skip-unreadable", help="Leave out logs that cannot be replayed.")
     ] = False,
     report: Annotated[bool, typer.Option("--report", help="Write report.html, too.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Show the replay in a Rerun viewer that runs, too.")] = False,
+    viewer: Annotated[
+        str | None, typer.Option(metavar="URL", help="Where that viewer listens [on this machine].")
+    ] = None,
 ) -> int:
     """Replay, measure, write the results folder, print the summary."""
     from copem_replay.results import check_target, write_results
@@ -141,10 +145,11 @@ def run(
     check_target(folder, overwrite=overwrite)
     ready, recordings, skipped = _ready(source, skip_unreadable=skip_unreadable)
     check_target(folder, overwrite=overwrite, inputs=[experiment, *(recording.path for recording in recordings)])
+    url = _viewer(ready, viewer) if live or viewer is not None else None
     from copem_replay.run import run as run_experiment
 
     result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
-    notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite)
+    notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite, viewer=url)
     _complain([f"note: {path}: skipped: {reason}" for path, reason in skipped] + [f"note: {note}" for note in notes])
     print(summary_text(result.summary))
     if result.sweep is not None:
@@ -314,6 +319,16 @@ def _ready(source: Any, *, skip_unreadable: bool) -> tuple[Any, Any, list[tuple[
     if found:
         raise InputError(found)
     return experiment, recordings, [(log.path, log.reason) for log in refused]
+
+
+def _viewer(experiment: Any, url: str | None) -> str:
+    """Where a viewer listens; refused before the replay where there is none, or nothing to show in it."""
+    from copem_replay.show import VIEWER, check_viewer
+
+    if experiment.show is None or experiment.show.run is None:
+        raise InputError("--live: nothing to show, the experiment says so (`show: null`, or its `run`)")
+    check_viewer(url or VIEWER)
+    return url or VIEWER
 
 
 def _workers(jobs: int | None) -> int:

@@ -78,8 +78,12 @@ def write_results(
     *,
     skipped: Sequence[tuple[Path, str]] = (),
     overwrite: bool = False,
+    viewer: str | None = None,
 ) -> list[str]:
-    """Write the folder of the contract. Returns what has to be said of it. Raises OutputError."""
+    """Write the folder of the contract. Returns what has to be said of it. Raises OutputError.
+
+    `viewer`: where a Rerun viewer listens that shall get what is written to .rrd, too.
+    """
     check_target(folder, overwrite=overwrite, inputs=[recording.path for recording in recordings])
     folder = folder.resolve()
     try:
@@ -89,7 +93,7 @@ def write_results(
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
     try:
         scratch.chmod(0o777 & ~_umask())
-        notes = _fill(scratch, folder, experiment, recordings, result, skipped)
+        notes = _fill(scratch, folder, experiment, recordings, result, skipped, viewer)
         _replace(scratch, folder)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
@@ -100,7 +104,7 @@ def write_results(
 
 def _fill(
     scratch: Path, folder: Path, experiment: Experiment, recordings: Sequence[Recording], result: Result,
-    skipped: Sequence[tuple[Path, str]],
+    skipped: Sequence[tuple[Path, str]], viewer: str | None,
 ) -> list[str]:  # fmt: skip
     data = experiment.as_written()
     data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
@@ -117,7 +121,7 @@ def _fill(
     for log in shown_logs(experiment, result):
         for shown in shown_runs(experiment, result, log):
             target = scratch / shown.stem if len(recordings) == 1 else scratch / shown.stem / log
-            said = _show(target, log, shown, experiment, recordings, result)
+            said = _show(target, log, shown, experiment, recordings, result, viewer)
             notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
     provenance = provenance_of(experiment, recordings, result, skipped, notes)
     (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -125,7 +129,13 @@ def _fill(
 
 
 def _show(
-    target: Path, log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
+    target: Path,
+    log: str,
+    shown: ShownRun,
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    result: Result,
+    viewer: str | None,
 ) -> list[str]:
     from copem_replay.families import family_of
     from copem_replay.show import write_rrd
@@ -147,17 +157,17 @@ def _show(
     said = write_mcap(
         Path(f"{target}.mcap"), recording.path, one.replay.scene, one.beliefs, rows, manifest, family_of(recording)
     )
-    write_rrd(
+    return said + write_rrd(
         Path(f"{target}.rrd"),
         one.replay,
         one.experiment,
-        next(iter(one.beliefs)),
+        one.beliefs,
         rows,
         summary,
         shown.run,
         run_is=shown.why,
+        viewer=viewer,
     )
-    return said
 
 
 def provenance_of(

@@ -20,6 +20,7 @@ from copem_replay.compare import compare, comparison_markdown, comparison_text
 from copem_replay.experiment_file import load, parse
 from experiments import TEXT, changed, drive
 from recordings import Obj, truth_topic, write_mcap, write_recording
+from viewer import free_port
 
 ROOT = Path(__file__).parents[1]
 COMMAND = Path(sys.executable).with_name("copem-replay")
@@ -133,8 +134,8 @@ class TestUsage:
 
     def test_every_option_of_run_is_in_its_help(self, call: Call) -> None:
         out = call("run", "--help").out
-        for option in ("--log", "--ego", "--out", "--runs", "--seed", "--jobs", "--overwrite", "--skip-unreadable"):
-            assert option in out
+        for option in ["log", "ego", "out", "runs", "seed", "jobs", "overwrite", "skip-unreadable", "live", "viewer"]:
+            assert f"--{option}" in out
 
     def test_version(self, call: Call) -> None:
         ended = call("--version")
@@ -592,6 +593,34 @@ class TestOptions:
         ended = call("run", "e.yaml", "--skip-unreadable", "--log", "drive.mcap", "--log", "none.mcap")
         assert ended.code == 2
         assert ended.lines == ["e.yaml:15: configurations.PEM.units[0]: no unit is named 'eg0'; did you mean ego?"]
+
+
+def shown(show: str) -> str:
+    """The small experiment with another `show`."""
+    return "\n".join(f"show: {show}" if line.startswith("show:") else line for line in TEXT.splitlines()) + "\n"
+
+
+class TestLive:
+    def test_refused_before_the_replay_where_nobody_listens(self, here: Path, call: Call) -> None:
+        (here / "e.yaml").write_text(shown("{run: 0}"))
+        url = f"rerun+http://127.0.0.1:{free_port()}/proxy"
+        ended = call("run", "e.yaml", "--live", "--viewer", url)
+        assert ended.code == 2
+        (line,) = ended.lines
+        assert line.startswith(f"--live: no viewer at {url} (")
+        assert line.endswith("); start one first: python -m rerun")
+        assert not (here / "out").exists()
+
+    def test_an_address_that_is_none(self, here: Path, call: Call) -> None:
+        (here / "e.yaml").write_text(shown("{run: 0}"))
+        said = "--viewer: expected an address such as rerun+http://127.0.0.1:9876/proxy, found 'localhost'"
+        assert call("run", "e.yaml", "--viewer", "localhost") == (2, "", [said])
+
+    @pytest.mark.parametrize("show", ["null", "{run: null}"])
+    def test_nothing_to_show(self, here: Path, call: Call, show: str) -> None:
+        (here / "e.yaml").write_text(shown(show))
+        said = "--live: nothing to show, the experiment says so (`show: null`, or its `run`)"
+        assert call("run", "e.yaml", "--live") == (2, "", [said])
 
 
 class TestWrittenExperiment:

@@ -26,7 +26,7 @@ from copem_replay.fusion.belief import Belief
 from copem_replay.replay import Replay, believed, prepare, replay_block
 from copem_replay.show import write_rrd
 from copem_replay.show.out import ELAPSED, TIME
-from copem_replay.show.recording import latest_known
+from copem_replay.show.recording import telling
 from copem_replay.tracks import CLASSES
 from scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
@@ -81,7 +81,7 @@ class Made:
 
     def write(self, path: Path, **changes: Any) -> None:
         columns = {"replay": self.replay, "beliefs": self.beliefs, "table": self.table, "summary": SUMMARY} | changes
-        write_rrd(path, columns["replay"], self.given, columns["beliefs"], columns["table"], columns["summary"], 3)
+        write_rrd(path, columns["replay"], self.given, [columns["beliefs"]], columns["table"], columns["summary"], 3)
 
 
 def make(path: Path, scene: Any, **changes: Any) -> Made:
@@ -141,6 +141,11 @@ def float32(*columns: Any) -> list[list[float]]:
     return np.stack(columns, axis=-1).astype(np.float32).tolist()
 
 
+def kinds_of_boxes(path: Path) -> dict[int, Any]:
+    context = static(path, "/")["AnnotationContext:context"][0]
+    return {info["class_id"]: info["class_description"]["info"] for info in context}
+
+
 # ------------------------------------------------------------------------------- boxes
 
 
@@ -152,6 +157,7 @@ def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
     assert [row[ELAPSED] for row in found] == np.rint(tracks.arrives_s[0] * 1e9).astype(int).tolist()
     assert [row[TIME] - T0_NS for row in found] == [row[ELAPSED] for row in found]
     scene = made.replay.scene
+    named = {number: info["label"] for number, info in kinds_of_boxes(made.path).items()}
     for frame, row in enumerate(found):
         mine = np.flatnonzero((tracks.frame_ix == frame) & tracks.valid[0])
         x, y, z, yaw, long, wide, high = (
@@ -163,7 +169,7 @@ def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
         assert row["Boxes3D:quaternions"] == float32(zero, zero, np.sin(yaw / 2), np.cos(yaw / 2))
         objects = tracks.row_object_ix[mine]
         kinds = [CLASSES[k] for k in scene.object_class[objects]]
-        assert row["Boxes3D:labels"] == [
+        assert [named[k] for k in row["Boxes3D:class_ids"]] == [
             f"{scene.object_ids[o]} {kind}" for o, kind in zip(objects, kinds, strict=True)
         ]
 
@@ -183,16 +189,23 @@ def test_what_lists_hold_and_when(made: Made) -> None:
 
 
 def test_colours_tell_ego_standing_and_configurations_apart(made: Made) -> None:
-    car, other = CLASSES.index("car"), CLASSES.index("other")
-    assert at(made.path, "/world/truth/boxes", 0)["Boxes3D:class_ids"] == [200, car, 0, 100 + other]
-    context = {
-        info["class_id"]: info["class_description"]["info"]
-        for info in static(made.path, "/")["AnnotationContext:context"][0]
-    }
-    assert context[200]["label"] == "ego"
-    assert context[100 + other]["color"] < context[other]["color"]
-    entities = [f"/world/{name}/boxes" for name in ("GT", "GT\\ late", "PEM", "pole", "none")]
-    assert len({static(made.path, entity)["Boxes3D:colors"][0] for entity in entities}) == 5
+    kinds = kinds_of_boxes(made.path)
+    ego, car, walker, bin = (kinds[k] for k in at(made.path, "/world/truth/boxes", 0)["Boxes3D:class_ids"])
+    assert (ego["label"], bin["label"]) == ("ego car", "bin other")
+    assert len({ego["color"], car["color"], walker["color"], bin["color"]}) == 4
+    assert bin["color"] < car["color"], "stationary: darker"
+    colours = [at(made.path, f"/world/{n}/boxes", 4.0)["Boxes3D:colors"][0] >> 8 for n in ("GT", "PEM", "pole")]
+    assert len(set(colours)) == 3
+
+
+def test_the_older_the_paler(made: Made) -> None:
+    def opaque(name: str, elapsed_s: float) -> set[int]:
+        return {colour & 0xFF for colour in at(made.path, f"/world/{name}/boxes", elapsed_s)["Boxes3D:colors"]}
+
+    assert opaque("GT", 3.0) == {220}
+    assert opaque("GT\\ late", 3.0) == {120}, "half a second: two and a half steps, to even"
+    # The pole lists at 0, 0.25, 0.5 s …, and the lists of others leave it as it is.
+    assert opaque("pole", 3.0) == {220}
 
 
 def test_ellipses_are_two_sigma(made: Made) -> None:
@@ -279,23 +292,53 @@ def test_events_in_words(made: Made) -> None:
         found = rows(made.path, f"/events/{name}")
         return [(row[ELAPSED] * 1e-9, row["TextLog:level"][0], row["TextLog:text"][0]) for row in found]
 
-    begin = "onset of 9 pedestrian, already at its first frame"
+    found = rows(made.path, "/events/onsets")
+    assert [(row[ELAPSED] * 1e-9, row["TextLog:text"][0]) for row in found] == [
+        (0.0, "onset of 9 pedestrian, already at its first frame"),
+        (2.0, "onset of 7 car"),
+    ]
     assert told("GT") == [
-        (0.0, "INFO", f"GT: {begin}"),
         (0.0, "INFO", "GT: 9 pedestrian detected by truth 0.00 s after the onset, at 70.0 m"),
-        (2.0, "INFO", "GT: onset of 7 car"),
         (2.0, "INFO", "GT: 7 car detected by truth 0.00 s after the onset, at 80.0 m"),
     ]
     assert told("PEM") == [
-        (0.0, "INFO", f"PEM: {begin}"),
-        (2.0, "INFO", "PEM: onset of 7 car"),
         (4.0, "INFO", "PEM: 7 car detected by ego 2.00 s after the onset, at 60.0 m"),
         (5.0, "WARN", "PEM: 9 pedestrian undetected when the log ended"),
     ]
-    assert told("none")[2:] == [
+    assert told("none") == [
         (4.0, "WARN", "none: 7 car left undetected"),
         (5.0, "WARN", "none: 9 pedestrian undetected when the log ended"),
     ]
+
+
+def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
+    mine = made.table[made.table["object_id"] == "7"]
+    verdicts = mine.assign(
+        conflict=True, braking_pass=[True, True, False, False, False], min_distance_m=[9.0, 8.0, 0.0, 0.25, 0.0],
+        impact_speed_mps=[0.0, 0.0, 4.0, 0.0, 10.0],
+    )  # fmt: skip
+    made.write(tmp_path / "x.rrd", table=verdicts)
+    path = tmp_path / "x.rrd"
+    [end] = rows(path, "/events/PEM")
+    text = "PEM: 7 car detected by ego 2.00 s after the onset, at 60.0 m; the ego does not stay clear"
+    assert (end["TextLog:level"], end["TextLog:text"]) == (["WARN"], [text])
+    assert static(path, "/difference")["TextDocument:text"][0].splitlines() == [
+        "**7 car**, onset at 2.00 s",
+        "",
+        "| configuration | known after | at distance | verdict | smallest distance | by |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        "| GT | 0.00 s | 80.0 m | pass | 9.0 m | truth |",
+        "| GT late | 0.50 s | 75.0 m | pass | 8.0 m | truth |",
+        "| PEM | 2.00 s | 60.0 m | **fail** at 4.0 m/s | 0.0 m | ego |",
+        "| pole | 0.00 s | 80.0 m | **fail** | 0.2 m | pole |",
+        "| none | never | – | **fail** at 10.0 m/s | 0.0 m | – |",
+    ]
+    # The strong line on the ground, and in its middle the same in short.
+    mark = at(path, "/world/PEM/marks/from", 4.0)
+    assert mark["Points3D:labels"] == ["7 detected +2.00 s, 60.0 m, does not stay clear"]
+    assert mark["Points3D:positions"] == [[30.0, 0.0, 0.0]]
+    [line] = at(path, "/world/PEM/marks/from/line", 4.0)["LineStrips3D:strips"]
+    assert line == [[0.0, 0.0, 0.0], [60.0, 0.0, 0.0]]
 
 
 def test_detected_before_the_onset_and_where_nobody_knows(made: Made, tmp_path: Path) -> None:
@@ -304,7 +347,7 @@ def test_detected_before_the_onset_and_where_nobody_knows(made: Made, tmp_path: 
     )  # fmt: skip
     made.write(tmp_path / "x.rrd", table=table)
     found = rows(tmp_path / "x.rrd", "/events/GT")
-    assert found[0]["TextLog:text"] == ["GT: 7 car detected by truth 0.50 s before the onset"]
+    assert [row["TextLog:text"] for row in found] == [["GT: 7 car detected by truth 0.50 s before the onset"]]
 
 
 def test_the_summary_says_which_run_and_lists_configurations_side_by_side(made: Made) -> None:
@@ -350,9 +393,13 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         [
             *CHANGES["configurations"],
             *["Visible share (ego white, any unit grey)", "Position error [m]"] * 2,
-            "Known objects",
+            "What each knows, when",
+            "GOSPA [m]",
+            "Measured objects known",
+            "What difference it made",
             "Events",
-            "Summary",
+            "Summary of all runs",
+            "Legend",
         ]
     )
     fewer = {name: made.beliefs[name] for name in ("GT", "PEM")}
@@ -413,12 +460,12 @@ def test_nothing_to_measure_no_ego_no_units(tmp_path: Path) -> None:
 def test_at_most_forty_bytes_a_box(tmp_path: Path) -> None:
     turn = np.random.default_rng(1)
     things = [Thing("ego", "car", standing(0, 0))]
-    for k in range(40):
+    for k in range(80):
         x, y, vx, vy = turn.normal(0, [60, 60, 8, 8])
         things.append(Thing(str(k), "car", driving(x, y, vx, vy), yaw_rad=float(np.arctan2(vy, vx))))
     names = {"PEM": {"units": ["ego"]}, **{f"late {k}": {"units": "all", "latency_s": k / 10} for k in range(4)}}
     made = make(
-        tmp_path / "x.rrd", recording(things, until_s=30.0), pems=CHANGES["pems"], configurations=names,
+        tmp_path / "x.rrd", recording(things, until_s=15.0), pems=CHANGES["pems"], configurations=names,
         units={"ego": EGO_UNIT | {"pem": "all"}, "pole": CHANGES["units"]["pole"] | {"rate_hz": None}},
     )  # fmt: skip
     boxes = len(made.replay.truth.frame_ix) + sum(int(belief.fused.valid.sum()) for belief in made.beliefs.values())
@@ -426,18 +473,40 @@ def test_at_most_forty_bytes_a_box(tmp_path: Path) -> None:
     assert made.path.stat().st_size <= 40 * boxes
 
 
-def test_of_many_objects_those_known_last_are_shown() -> None:
-    table = pd.DataFrame(
+def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> None:
+    looks = pd.DataFrame(
         {
-            "object_id": ["a", "b", "c", "d", "a", "b", "c", "d"],
-            "time_to_detection_s": [0.0, 1.0, 5.0, 0.5, 0.2, None, 0.0, 0.5],
+            "configuration": ["GT"] * 5 + ["x"] * 5 + ["y"] * 5,
+            "object_id": ["a", "b", "c", "d", "e"] * 3,
+            "onset_s": 1.0,
+            "ended_s": 10.0,
+            "time_to_detection_s": [0.0] * 5 + [0.0, 1.0, 5.0, 0.5, None] + [0.2, None, 5.0, 0.5, None],
         }
     )
-    assert latest_known(table, 2) == ["b", "c"], "b was never known once, c after 5 s"
-    assert latest_known(table, 9) == ["a", "b", "c", "d"]
+    # Apart: a 0.2 s, b 8 s (never: 9 s); as soon as each other c after 5 s, d after 0.5 s, e never.
+    assert telling(looks, ["GT"], 1) == ["b"]
+    assert telling(looks, ["GT"], 2) == ["a", "b"]
+    assert telling(looks, ["GT"], 3) == ["a", "b", "e"]
+    assert telling(looks, ["GT"], 9) == ["a", "b", "c", "d", "e"]
+    meeting = looks.assign(conflict=looks["object_id"] == "d")
+    assert telling(meeting, ["GT"], 2) == ["b", "d"]
+    assert telling(looks[looks["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], "nothing but the truth"
 
 
 def test_colours_do_not_repeat() -> None:
     colours = configuration_colours([str(k) for k in range(28)])
     assert len(set(colours.values())) == 28
     assert all(0 <= c <= 255 for colour in colours.values() for c in colour)
+
+
+def test_a_disk_that_is_full_is_an_error_and_leaves_nothing(made: Made, tmp_path: Path) -> None:
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))  # of one file: what is more is refused as on a full disk
+    try:
+        with pytest.raises(OutputError, match=r"x\.rrd: cannot be written: File too large"):
+            made.write(tmp_path / "x.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Recordings for the viewer, read back: fields of view, lines of sight, what is known, marks at onset and detection.
+"""Recordings for the viewer, read back: fields of view, what is known, marks at onset and detection, the eye.
 
 Mostly an ego that stands at the origin and looks east, and pedestrians who are measured from their first frame on.
 """
@@ -108,78 +108,6 @@ def test_fields_come_and_go_with_the_carrier(passing: Made) -> None:
     assert turned == [[pytest.approx([0, 0, 1, 0], abs=1e-6)]] * 22  # north, and a quarter turn more
 
 
-# ------------------------------------------------------------------------------- lines of sight
-
-
-@pytest.fixture(scope="module")
-def hiding(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """A truck hides pedestrian 2, behind the ego, until it leaves at 1 s; an obstacle hides pedestrian 4."""
-    scene = recording(
-        [
-            Thing("ego", "car", standing(0, 0)),
-            Thing("2", "pedestrian", standing(-30, 0), there=lambda t: t < 1.51),
-            Thing("3", "truck", standing(-15, 0.5), there=lambda t: t < 0.99),
-            Thing("4", "pedestrian", standing(30, 0)),
-        ],
-        until_s=2.0,
-    )
-    return make(
-        tmp_path_factory.mktemp("hiding") / "replay.rrd", scene, obstacles=[WALL], measure=PERSON,
-        units={"pole": {"at": [0, 50], "height_m": 6.0, "ground_z_m": 0.0, "pem": "all"}, "ego": EGO_UNIT},
-    )  # fmt: skip
-
-
-def test_who_is_hidden_and_by_whom(hiding: Made) -> None:
-    # From the ego's unit, though it is the second: to the middle of the truck, and of the wall, 1 m to 41 m high.
-    first = at(hiding.path, "/world/sight/hidden", 0.5)
-    told = dict(zip(first["LineStrips3D:labels"], lines(first), strict=True))
-    assert told.keys() == {"2 hidden by 3 (share 0.00)", "4 hidden by obstacle 0 (share 0.00)"}
-    ego = [0, 0, pytest.approx(1.8)]
-    assert told["2 hidden by 3 (share 0.00)"].tolist() == [ego, [-15, 0.5, 1.75]]
-    assert told["4 hidden by obstacle 0 (share 0.00)"].tolist() == [ego, [10, 0, 21]]
-    assert lines(at(hiding.path, "/world/sight/clear", 0.5)) == []
-    # The truck has left: seen. Then the pedestrian has, too.
-    [line] = lines(at(hiding.path, "/world/sight/clear", 1.2))
-    assert line.tolist() == [ego, [-30, 0, pytest.approx(0.9)]]
-    assert [len(lines(row)) for row in rows(hiding.path, "/world/sight/clear")] == [0] * 10 + [1] * 6 + [0] * 5
-    assert [len(lines(row)) for row in rows(hiding.path, "/world/sight/hidden")] == [2] * 10 + [1] * 11
-    styles = [static(hiding.path, f"/world/sight/{name}") for name in ("clear", "hidden")]
-    assert styles[0]["LineStrips3D:colors"] != styles[1]["LineStrips3D:colors"]
-
-
-def test_the_line_says_how_much_is_seen(tmp_path: Path) -> None:
-    # Half as far as the pedestrian, a wall reaches 1 m up; seen from 2 m, it covers his lower part: he is 1.8 m high,
-    # the ray over the wall meets the ground at his face.
-    low = WALL | {"polygon_m": [[14.5, -9], [14.9, -9], [14.9, 9], [14.5, 9]], "ground_z_m": 0.0, "height_m": 1.5}
-    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
-    made = make(tmp_path / "x.rrd", scene, obstacles=[low], measure=PERSON, units={"ego": EGO_UNIT | {"height_m": 2.0}})
-    # From 2 m over 1.5 m at 14.9 m: 1 m up at 29.75 m, give or take the wall's thickness: 0.8 m of 1.8 m are seen.
-    [text] = at(made.path, "/world/sight/hidden", 0.0)["LineStrips3D:labels"]
-    assert text == "9 hidden by obstacle 0 (share 0.44)"
-
-
-def test_without_a_unit_on_the_ego_the_first_looks_and_without_its_carrier_nobody(tmp_path: Path) -> None:
-    scene = recording(
-        [
-            Thing("ego", "car", standing(0, 0)),
-            Thing("7", "car", standing(0, 9), there=lambda t: t < 0.51),
-            Thing("9", "pedestrian", standing(30, 0)),
-        ],
-        until_s=1.0,
-    )
-    on_7 = {"on": "7", "height_m": 2.0, "pem": "all"}
-    made = make(
-        tmp_path / "x.rrd", scene, units={"obu": on_7, "own": on_7 | {"on": "ego"}}, measure=PERSON,
-        configurations={"o": {"units": ["obu"]}},
-    )  # fmt: skip
-    assert [len(lines(row)) for row in rows(made.path, "/world/sight/clear")] == [1] * 11
-    other = make(
-        tmp_path / "y.rrd", scene, units={"obu": on_7}, measure=PERSON, configurations={"o": {"units": ["obu"]}}
-    )
-    assert [len(lines(row)) for row in rows(other.path, "/world/sight/clear")] == [1] * 6 + [0] * 5
-    assert lines(rows(other.path, "/world/sight/clear")[0])[0].tolist() == [[0, 9, 2], [30, 0, pytest.approx(0.9)]]
-
-
 # ------------------------------------------------------------------------------- known, marks
 
 
@@ -210,19 +138,23 @@ def test_marks_stay_where_objects_were(passing: Made) -> None:
     assert begin["elapsed"] == 0
     assert begin["Points3D:labels"] == ["onset 9"]
     assert begin["Points3D:positions"] == [[60, 0, 0]]
-    told = {name: rows(passing.path, f"/world/{name}/marks") for name in ("GT", "PEM")}
-    assert [row["Points3D:labels"] for row in told["PEM"]] == [["9 detected +0.00 s, 60.0 m"]]
-    assert told["PEM"][0]["Points3D:positions"] == [[60, 0, pytest.approx(1.8)]]
+    [there] = rows(passing.path, "/world/PEM/marks")
+    assert there["Points3D:positions"] == [[60, 0, pytest.approx(1.8)]]
+    [told] = rows(passing.path, "/world/PEM/marks/from")
+    assert told["Points3D:labels"] == ["9 detected +0.00 s, 60.0 m"]
+    assert told["Points3D:positions"] == [[30, 0, 0]]
+    assert static(passing.path, "/world/PEM/marks/from")["Points3D:show_labels"] == [True]
     colours = [static(passing.path, f"/world/{name}/marks")["Points3D:colors"] for name in ("GT", "PEM")]
     assert colours[0] != colours[1]
     assert not rows(passing.path, "/world/pole/marks")  # he is not in its sector
 
 
 def test_marks_gather(tmp_path: Path) -> None:
-    # Two at once, a third later; the configuration learns half a second later, when the third has walked on.
+    # Two at once, two later; the configuration learns half a second later, when one has walked on.
     scene = recording(
         [
             Thing("ego", "car", standing(0, 0)),
+            Thing("6", "pedestrian", standing(10, 0), there=lambda t: t > 0.99),
             Thing("7", "pedestrian", driving(20, 0, 0, 2), there=lambda t: t > 0.99),
             Thing("8", "pedestrian", standing(30, 0)),
             Thing("9", "pedestrian", standing(40, 0)),
@@ -234,13 +166,18 @@ def test_marks_gather(tmp_path: Path) -> None:
     assert [row["elapsed"] / 1e9 for row in begin] == [0, 1]
     assert [row["Points3D:labels"] for row in begin] == [
         ["onset 8", "onset 9"],
-        ["onset 8", "onset 9", "onset 7"],
+        ["onset 8", "onset 9", "onset 6", "onset 7"],
     ]
-    assert begin[1]["Points3D:positions"] == [[30, 0, 0], [40, 0, 0], [20, 2, 0]]
+    assert begin[1]["Points3D:positions"] == [[30, 0, 0], [40, 0, 0], [10, 0, 0], [20, 2, 0]]
     last = rows(made.path, "/world/GT/marks")[-1]
     assert last["elapsed"] / 1e9 == 1.5
-    assert last["Points3D:labels"][-1] == "7 detected +0.50 s, 20.2 m"  # √(20² + 3²)
     assert last["Points3D:positions"][-1] == [20, 3, pytest.approx(1.8)]
+    told = rows(made.path, "/world/GT/marks/from")
+    assert [len(row["Points3D:labels"]) for row in told] == [2, 4]
+    assert told[-1]["Points3D:labels"][-1] == "7 detected +0.50 s, 20.2 m"  # √(20² + 3²)
+    # More than three: words under the pointer, and no lines.
+    assert static(made.path, "/world/GT/marks/from")["Points3D:show_labels"] == [False]
+    assert not list(chunks(made.path, "/world/GT/marks/from/line"))
 
 
 def test_marks_on_the_curves(tmp_path: Path) -> None:
@@ -279,32 +216,63 @@ def test_fixed_units_have_no_names_when_there_are_many(tmp_path: Path) -> None:
         assert static(made.path, "/world/units/p0")["Points3D:show_labels"] == [named]
 
 
-def test_the_eye_is_on_the_ego_and_sees_the_object(passing: Made) -> None:
+def eyes(path: Path) -> list[list[Any]]:
     from rerun.chunk import RrdReader
 
-    reader = RrdReader(passing.path)
+    reader = RrdReader(path)
     [blueprint] = reader.blueprints()
-    batches = [c.to_record_batch() for c in reader.stream(store=blueprint)]
-    eyes = [
+    return [
         [np.array(batch.column(f"EyeControls3D:{name}")[0].as_py()[0]) for name in ("position", "look_target")]
-        for batch in batches
+        for batch in (c.to_record_batch() for c in reader.stream(store=blueprint))
         if "EyeControls3D:position" in batch.schema.names
     ]
-    assert len(eyes) == 3
-    position, target = eyes[0]
-    assert target == pytest.approx([0, 0, 0.8], abs=0.06)
-    ahead = (target - position) / np.linalg.norm(target - position)
+
+
+def in_view(eye: Any, target: Any, place: Any, wide: float) -> bool:
+    ahead = (target - eye) / np.linalg.norm(target - eye)
     right = np.array([ahead[1], -ahead[0], 0]) / np.hypot(ahead[0], ahead[1])
-    seen = np.array([60, 0, 0.9]) - position
+    seen, half = np.array(place) - eye, np.tan(np.deg2rad(55) / 2)
     up = np.cross(right, ahead)
-    half = np.tan(np.deg2rad(55) / 2)
-    assert seen @ ahead > 0
-    assert abs(seen @ up) <= half * (seen @ ahead)
-    assert abs(seen @ right) <= 1.7 * half * (seen @ ahead)
-    assert np.linalg.norm(position) < 50
+    return bool(seen @ ahead > 0 and max(abs(seen @ up), abs(seen @ right) / wide) <= half * (seen @ ahead))
 
 
-def test_no_nan_anywhere(passing: Made, hiding: Made) -> None:
+def test_the_eye_looks_ahead_of_the_ego_and_sees_the_object(tmp_path: Path) -> None:
+    # Northwards at 10 m/s; the pedestrian appears 20 m ahead: the middle between both is 10 m ahead of the ego.
+    scene = recording(
+        [
+            Thing("ego", "car", driving(0, 0, 0, 10), yaw_rad=np.pi / 2),
+            Thing("9", "pedestrian", standing(0, 30), there=lambda t: t > 0.99),
+        ],
+        until_s=2.0,
+    )
+    made = make(tmp_path / "x.rrd", scene, measure=PERSON)
+    found = eyes(made.path)
+    assert len(found) == 2
+    for position, target in found:
+        assert target == pytest.approx([0, 20, 0.8], abs=0.06)
+        # Two views side by side are each about one and a half times as wide as high.
+        assert in_view(position, target, [0, 30, 0.9], 1.55)
+        assert in_view(position, target, [0, 10, 0.75], 1.55)
+        assert np.linalg.norm(position - target) < 30
+    followed = rows(made.path, "/world/eye")
+    assert [row["Points3D:positions"] for row in followed[:2]] == [[pytest.approx([0, y, 0.75])] for y in (10, 11)]
+
+
+def test_without_an_ego_the_eye_sees_the_unit_and_who_passes_it(tmp_path: Path) -> None:
+    scene = recording([Thing("7", "car", driving(40, 0, -10, 10))], until_s=4.0, ego=None)
+    pole = {"at": [20, -10], "height_m": 6.0, "ground_z_m": 0.0, "pem": "all"}
+    made = make(
+        tmp_path / "x.rrd", scene, units={"pole": pole}, configurations={"pole": {"units": ["pole"]}},
+        measure={"onset": {"kind": "appears"}, "distance_to": "pole"},
+    )  # fmt: skip
+    [[position, target]] = eyes(made.path)
+    # The last part of its way is more than 40 m from the pole.
+    for place in ([40, 0, 0.75], [20, 20, 0.75], [20, -10, 0.75]):
+        assert in_view(position, target, place, 3.1)
+    assert not list(chunks(made.path, "/world/eye"))
+
+
+def test_no_nan_anywhere(passing: Made) -> None:
     from rerun.chunk import RrdReader
 
     def numbers(value: Any) -> list[float]:
@@ -312,8 +280,7 @@ def test_no_nan_anywhere(passing: Made, hiding: Made) -> None:
             return [n for v in value for n in numbers(v)]
         return [value] if isinstance(value, float) else []
 
-    for made in (passing, hiding):
-        for chunk in RrdReader(made.path).stream():
-            batch = chunk.to_record_batch()
-            columns = [batch.column(n).to_pylist() for n in batch.schema.names if ":" in n]
-            assert np.isfinite(numbers(columns)).all(), chunk.entity_path
+    for chunk in RrdReader(passing.path).stream():
+        batch = chunk.to_record_batch()
+        columns = [batch.column(n).to_pylist() for n in batch.schema.names if ":" in n]
+        assert np.isfinite(numbers(columns)).all(), chunk.entity_path

@@ -20,6 +20,7 @@ import pandas as pd
 
 import bench_fusion
 import bench_read
+import bench_viewer
 from copem_replay.check import problems, read_logs
 from copem_replay.experiment_file import load, log_paths
 from copem_replay.read import read
@@ -128,12 +129,13 @@ def reading() -> Iterator[dict[str, object]]:
 
 
 def writing() -> Iterator[dict[str, object]]:
-    """The crossing: objects per second into MCAP, boxes per second and bytes per box into .rrd."""
+    """The crossing: objects per second into MCAP, boxes per second and bytes per box into .rrd, seconds to see it."""
     from copem_replay.show import write_rrd
     from copem_replay.summary import horizon_s, summary
     from copem_replay.write import write_mcap
 
     experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
+    experiment = experiment.model_copy(update={"configurations": experiment.shown()})
     ready = prepare(recordings[0], experiment)
     beliefs = believed(ready, experiment, 0)
     table = replay_block(ready, experiment, np.arange(1))
@@ -145,12 +147,13 @@ def writing() -> Iterator[dict[str, object]]:
         mcap, rrd = folder / "w.mcap", folder / "w.rrd"
         seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, beliefs, table, {}), 1)
         yield {"mcap_objects_per_s": round(listed / seconds)}
-        seconds = best(lambda: write_rrd(rrd, ready, experiment, beliefs, table, rows, 0), 3)
+        seconds = best(lambda: write_rrd(rrd, ready, experiment, [beliefs], table, rows, 0), 3)
         yield {
             "rrd_boxes_per_s": round(shown / seconds),
             "rrd_bytes_per_box": round(rrd.stat().st_size / shown, 1),
             "boxes": shown,
         }
+        yield bench_viewer.first_picture(rrd)
 
 
 def commands() -> Iterator[dict[str, object]]:

@@ -84,7 +84,7 @@ def write_beside(
         path,
         prepare(recording, experiment, onsets_of=sides[0].results.experiment),
         experiment,
-        {one.label: beliefs[one.label] for one in wanted},
+        [{one.label: beliefs[one.label] for one in wanted}],
         table.reset_index(drop=True),
         _summary(sides, wanted),
         number,

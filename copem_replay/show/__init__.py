@@ -2,21 +2,25 @@
 
 | entity | is |
 |---|---|
-| `world/truth/boxes`, `measured`, `paths`, `onsets` | the log; of what is measured name, path, place at its onset |
+| `world/truth/boxes`, `paths`, `onsets` | the log; of whom we look at, ways, and places at their onsets |
 | `world/static`, `world/units/<unit>`, `world/fields/<unit>` | obstacles, units, and the fields of view of their PEMs |
-| `world/sight/clear`, `hidden` | lines from the ego's first unit to what is measured, or to what hides it |
-| `world/<configuration>/boxes`, `covariance`, `marks` | what the receiver believes, 2σ of where, where it first knew |
+| `world/<configuration>/boxes`, `covariance` | what the receiver believes, paler the older; 2σ of where |
+| `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; who listed it |
+| `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where it was first known, and from how far away |
+| `world/eye` | what the eye follows |
+| `lanes/<object>` | absent, out of view, hidden, visible, captured, known: a lane per configuration |
 | `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
 | `plots/visible_share/<object>/mark 1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | believed to true position at the instant the list is available |
-| `plots/known/<configuration>`, `truth` | how many of the measured objects the newest list holds, and the log |
-| `events/<configuration>`, `summary` | in words |
+| `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
 | `…/difference/…`, `plots/error_difference` | where configurations are compared with a baseline (`differences.py`) |
+| `events/onsets`, `events/<configuration>`, `difference`, `summary`, `legend` | in words |
 
-Columns are sent whole, an entity holds all its objects: hundreds of entities slow the viewer down. It shows the newest
-row of an entity until the next one, so an instant at which there is nothing has an empty row of its own.
+Columns are sent in slices of time, an entity holds all its objects: hundreds of entities slow the viewer down. It shows
+the newest row of an entity until the next one, so an instant at which there is nothing has an empty row of its own.
 """
 
 from copem_replay.show.recording import write_rrd
+from copem_replay.show.stream import VIEWER, check_viewer
 
-__all__ = ["write_rrd"]
+__all__ = ["VIEWER", "check_viewer", "write_rrd"]

@@ -10,24 +10,27 @@ import pandas as pd
 import pyarrow as pa
 
 from copem_replay.colours import Rgb
+from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
+from copem_replay.onset import Reference
 from copem_replay.replay import Replay
 from copem_replay.resample import states_at
-from copem_replay.show.out import Out, f32, ns, part_of
+from copem_replay.show.out import Out, f32, ns, part_of, short_ids
 from copem_replay.show.plots import BY_ANY, BY_EGO, Curve
+from copem_replay.show.words import verdict_of
 from copem_replay.tracks import SAME_INSTANT_NS, Float, Int
 from copem_replay.units import carrier
 
 ONSET: Rgb = (255, 130, 220)
 MARK_SIZE = 6.5
-NAMED_ONSETS = 3
-"""With more of them than this their names are not shown (chosen: most lie under a detection's)."""
+NAMED = 3
+"""With more marks than this they have no lines, and words only under the pointer (chosen: they lie on each other)."""
 
 
 def onsets(out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, shown: Sequence[int]) -> None:
     """“onset 2” where the object then was."""
     part = _of(replay, table, shown).drop_duplicates("object_id")
-    texts = [f"onset {name}" for name in part["object_id"]]
+    texts = [f"onset {short_ids(replay.scene)[replay.scene.object_number[name]]}" for name in part["object_id"]]
     _stay(
         out,
         ["world", "truth", "onsets"],
@@ -38,34 +41,77 @@ def onsets(out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame
         texts,
         ONSET,
         up=-1,
-        named=len(texts) <= NAMED_ONSETS,
     )
 
 
 def detections(
     out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, name: str, shown: Sequence[int], colour: Rgb
 ) -> None:
-    """“2 detected +0.90 s, 13.5 m” where the object then truly was, for the configuration `name`."""
+    """Where the object truly was when the configuration `name` first knew it, and a line there from the ego.
+
+    “2 detected +0.90 s, 13.5 m, stops” is in its middle: its length is the distance at detection.
+    """
     part = _of(replay, table, shown)
     part = part[(part["configuration"] == name) & part["detected"]]
-    texts = [_told(look) for look in part.itertuples()]
-    _stay(out, ["world", part_of(name), "marks"], replay, experiment, part, "detection_s", texts, colour, up=1)
+    path = ["world", part_of(name), "marks"]
+    reference = replay.surroundings.reference
+    order = np.argsort(part["detection_s"].to_numpy(), kind="stable")
+    part = part.iloc[order]
+    told = [
+        _told(look, short_ids(replay.scene)[replay.scene.object_number[look.object_id]]) for look in part.itertuples()
+    ]
+    try:
+        at = reference(part["detection_s"].to_numpy(dtype=float))
+    except ExperimentError:  # nobody's distances are measured
+        at = None
+    _stay(out, path, replay, experiment, part, "detection_s", [""] * len(part) if at else told, colour, up=1)
+    if at is not None:
+        _from_reference(out, [*path, "from"], replay, experiment, part, at, told, colour)
+
+
+def _from_reference(
+    out: Out, path: list[str], replay: Replay, experiment: Experiment, part: pd.DataFrame, at: Reference,
+    texts: Sequence[str], colour: Rgb,
+) -> None:  # fmt: skip
+    """Lines on the ground from the reference to the objects at detection, and what is said of each in its middle."""
+    import rerun as rr
+
+    object_ix = part["object_id"].map(replay.scene.object_number).to_numpy(dtype=np.int64)
+    time_s = part["detection_s"].to_numpy(dtype=float)
+    to, there = states_at(replay.truth, object_ix, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s)
+    kept = np.flatnonzero(there & at.present)
+    ground = to["z_m"] - to["height_m"] / 2
+    ends = [f32(x[kept], y[kept], ground[kept]) for x, y in ((at.x_m, at.y_m), (to["x_m"], to["y_m"]))]
+    instants, last = np.unique(ns(time_s[kept])[::-1], return_index=True)
+    counts = len(kept) - last
+    _, mark = np.nonzero(np.arange(len(kept)) < counts[:, None])
+    lines = np.stack(ends, axis=1)[mark]
+    named = len(kept) <= NAMED
+    if named:
+        out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=lines).partition(counts))
+        out.static([*path, "line"], rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.0)))
+    words = pa.array(texts, pa.string()).take(pa.array(kept[mark]))
+    out.columns(path, instants, rr.Points3D.columns(positions=lines.mean(axis=1), labels=words).partition(counts))
+    small = rr.Radius.ui_points(1)
+    out.static(path, rr.Points3D.from_fields(colors=[colour], radii=small, show_labels=named))
 
 
 def _of(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> pd.DataFrame:
     return table[table["object_id"].isin([replay.scene.object_ids[k] for k in shown])]
 
 
-def _told(look: Any) -> str:
-    far_m = look.distance_at_detection_m
-    return f"{look.object_id} detected {look.time_to_detection_s:+.2f} s" + (
-        "" if np.isnan(far_m) else f", {far_m:.1f} m"
-    )
+def _told(look: Any, name: str) -> str:
+    parts = [f"{name} detected {look.time_to_detection_s:+.2f} s"]
+    if not np.isnan(look.distance_at_detection_m):
+        parts.append(f"{look.distance_at_detection_m:.1f} m")
+    if (verdict := verdict_of(look)) is not None:
+        parts.append(verdict)
+    return ", ".join(parts)
 
 
 def _stay(
     out: Out, path: list[str], replay: Replay, experiment: Experiment, part: pd.DataFrame, when: str,
-    texts: Sequence[str], colour: Rgb, *, up: int, named: bool = True,
+    texts: Sequence[str], colour: Rgb, *, up: int,
 ) -> None:  # fmt: skip
     """A point per row of `part`, on the object at the instant `when`: each row of the entity has all until then."""
     import rerun as rr
@@ -83,8 +129,8 @@ def _stay(
     _, mark = np.nonzero(np.arange(len(place)) < counts[:, None])
     columns = rr.Points3D.columns(positions=place[mark], labels=words.take(pa.array(mark)))
     out.columns(path, instants, columns.partition(counts))
-    size = rr.Radius.ui_points(5)
-    out.static(path, rr.Points3D.from_fields(colors=[colour], radii=size, show_labels=named))
+    size = rr.Radius.ui_points(3)
+    out.static(path, rr.Points3D.from_fields(colors=[colour], radii=size, show_labels=False))
 
 
 def on_curves(

@@ -7,10 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from copem_replay.appraise import settings_of
+from copem_replay.candidates import Candidates
 from copem_replay.colours import TRUTH, Rgb
 from copem_replay.experiment import Experiment
+from copem_replay.fusion.belief import Belief
+from copem_replay.gospa import gospa
+from copem_replay.onset import measured_objects
 from copem_replay.replay import Replay
-from copem_replay.resample import states_at
+from copem_replay.resample import AROUND_S, at_instants, states_at
 from copem_replay.show.out import Out, by_frame, elapsed_ns, part_of
 from copem_replay.show.world import EGO
 from copem_replay.tracks import Float, Int, Tracks
@@ -18,6 +23,9 @@ from copem_replay.units import carrier
 
 BY_EGO, BY_ANY = "ego", "any unit"
 """Whose share a curve is: the best of the ego's units, the best of all."""
+
+LISTS_AT_ONCE = 2_000
+"""For so many lists the truth is interpolated at a time (chosen)."""
 
 _LOOKS = {BY_EGO: (EGO, 3.0), BY_ANY: (TRUTH, 1.5)}
 
@@ -30,15 +38,15 @@ class Curve:
     share: Float
 
 
-def share_curves(replay: Replay, experiment: Experiment, object_ix: int) -> dict[str, Curve]:
-    """By whom an object is seen, and how much of it; nobody's curve is left out."""
-    scene, tracks = replay.scene, replay.measured.tracks
+def share_curves(replay: Replay, experiment: Experiment, found: Candidates, object_ix: int) -> dict[str, Curve]:
+    """By whom an object is seen, and how much of it; nobody's curve is left out. `found`: its rows, at least."""
+    scene, tracks = replay.scene, found.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
     share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
     rows = np.flatnonzero(tracks.row_object_ix == object_ix)
-    share[tracks.frame_ix[rows]] = replay.measured.look.visible_share[rows]
+    share[tracks.frame_ix[rows]] = found.look.visible_share[rows]
     # A unit without a list of the object says nothing about it: the best of the others counts.
     return {
         whose: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
@@ -96,17 +104,53 @@ def position_errors(
         out.static(path, style)
 
 
-def known(out: Out, replay: Replay, beliefs: Mapping[str, Tracks], colours: Mapping[str, Rgb]) -> None:
-    """How many of all measured objects each configuration's newest list holds, beside how many there are."""
+def known(out: Out, replay: Replay, name: str, tracks: Tracks, colour: Rgb | None = None) -> None:
+    """How many of all measured objects a configuration's newest list holds; without a colour: how many there are."""
     import rerun as rr
 
-    lists = [("truth", "truth", replay.truth, TRUTH, 4.0)]
-    lists += [(part_of(name), name, beliefs[name], colour, 1.5) for name, colour in colours.items()]
-    for part, name, tracks, colour, width in lists:
-        _, counts = by_frame(tracks, tracks.valid[0] & np.isin(tracks.row_object_ix, replay.looks.object_ix))
-        changes = np.flatnonzero(np.diff(counts, prepend=-1))  # a step lasts until the next
-        rows = np.union1d(changes, [len(counts) - 1]) if len(counts) else changes
-        path = ["plots", "known", part]
-        out.columns(path, elapsed_ns(tracks)[rows], rr.Scalars.columns(scalars=counts[rows].astype(float)))
-        until_next = rr.components.InterpolationMode.StepAfter
-        out.static(path, rr.SeriesLines(names=name, colors=colour, widths=width, interpolation_mode=until_next))
+    _, counts = by_frame(tracks, tracks.valid[0] & np.isin(tracks.row_object_ix, replay.looks.object_ix))
+    changes = np.flatnonzero(np.diff(counts, prepend=-1))  # a step lasts until the next
+    rows = np.union1d(changes, [len(counts) - 1]) if len(counts) else changes
+    path = ["plots", "known", name if colour is None else part_of(name)]
+    out.columns(path, elapsed_ns(tracks)[rows], rr.Scalars.columns(scalars=counts[rows].astype(float)))
+    until_next = rr.components.InterpolationMode.StepAfter
+    colours, width = colour or TRUTH, 1.5 if colour else 4.0
+    out.static(path, rr.SeriesLines(names=name, colors=colours, widths=width, interpolation_mode=until_next))
+
+
+def gospa_of(replay: Replay, experiment: Experiment, belief: Belief) -> tuple[Int, Float]:
+    """GOSPA (m) of each list at the instant it is available: when (K,), and how much (K,).
+
+    Of the measured objects that are in the log then against the entries that are about one of them, and the ghosts of
+    their classes; cut-off and power as in `measure`.
+    """
+    scene, fused, measure = replay.scene, belief.fused, experiment.measure
+    settings = settings_of(measure, scene.end_s)
+    measured = np.isin(np.arange(len(scene.object_ids) + 1), measured_objects(scene, measure))  # the last: nobody
+    ghosts = replay.surroundings.classes(measure)[belief.class_of(scene)] & (fused.row_object_ix < 0)
+    near_s, gap_s = fused.arrives_s[0], experiment.max_gap_s + AROUND_S
+    near = replay.truth if not len(near_s) else replay.truth.captured_between(near_s[0] - gap_s, near_s[-1] + gap_s)
+    truth = near.take_tracks(measured[near.object_ix])
+    rows, listed = by_frame(fused, fused.valid[0] & (measured[fused.row_object_ix] | ghosts))
+    elapsed, starts = elapsed_ns(fused), np.append(0, np.cumsum(listed))
+    value_m = np.empty(len(listed))
+    for first in range(0, len(listed), LISTS_AT_ONCE):
+        stamps = scene.t0_ns + elapsed[first : first + LISTS_AT_ONCE]
+        world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
+        order, bounds = world.by_frame
+        for f in range(len(stamps)):
+            there, said = order[bounds[f] : bounds[f + 1]], rows[starts[first + f] : starts[first + f + 1]]
+            both = (np.stack([t.x_m[0, r], t.y_m[0, r]], axis=-1) for t, r in ((world, there), (fused, said)))
+            value_m[first + f] = gospa(*both, cutoff_m=settings.cutoff_m, power=settings.power).value_m
+    return elapsed, value_m
+
+
+def gospas(out: Out, replay: Replay, experiment: Experiment, name: str, belief: Belief, colour: Rgb) -> None:
+    """The curve of one configuration."""
+    import rerun as rr
+
+    elapsed, value_m = gospa_of(replay, experiment, belief)
+    path = ["plots", "gospa", part_of(name)]
+    out.columns(path, elapsed, rr.Scalars.columns(scalars=value_m))
+    until_next = rr.components.InterpolationMode.StepAfter
+    out.static(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, interpolation_mode=until_next))

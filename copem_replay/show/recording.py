@@ -2,106 +2,155 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.atomic import atomic_file
-from copem_replay.colours import configuration_colours
-from copem_replay.errors import OutputError
+from copem_replay.colours import Rgb, configuration_colours
 from copem_replay.experiment import Experiment
 from copem_replay.fusion.belief import Belief
 from copem_replay.replay import Replay
-from copem_replay.show import differences, layout, marks, plots, sight, units, words, world
+from copem_replay.show import differences, knowledge, layout, marks, plots, units, words, world
+from copem_replay.show.choice import SHOWN_OBJECTS, VIEWED, telling, viewed
+from copem_replay.show.eye import eye_on, follow
 from copem_replay.show.out import Out, digest, part_of
-
-SHOWN_OBJECTS = 6
-"""How many measured objects have names, lines of sight, marks and plots of their own (chosen)."""
+from copem_replay.show.sight import sight
+from copem_replay.show.status import status_of
+from copem_replay.show.stream import Live, file_stream
+from copem_replay.tracks import TRUTH
 
 
 def write_rrd(
     path: Path,
     replay: Replay,
     experiment: Experiment,
-    beliefs: Mapping[str, Belief],
+    beliefs: Iterable[Mapping[str, Belief]],
     table: pd.DataFrame,
     summary: pd.DataFrame,
     run: int,
     *,
     run_is: str = "",
     baseline: str | None = None,
-) -> None:
-    """Write one run of one log. Raises OutputError.
+    viewer: str | None = None,
+) -> list[str]:
+    """Write one run of one log, and send it to a viewer, too. Returns what has to be said. Raises OutputError.
 
-    `beliefs`: per configuration what the receiver believes in this run, a frame per list it issued (one unit, values
-    (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and runs. `run_is`:
-    why it is this run, part of the recording's name. `baseline`: the configuration differences to which are marked.
+    `beliefs`: stretch by stretch, per configuration what the receiver believes in this run, a frame per list it issued
+    (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and
+    runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration differences to which
+    are marked.
     """
     import rerun as rr
 
-    shown = [replay.scene.object_number[name] for name in latest_known(table, SHOWN_OBJECTS)]
-    blueprint, appearance = layout.blueprint(replay, experiment, table, list(beliefs), shown, baseline)
+    rest = iter(beliefs)
+    first = next(rest)
+    chosen = viewed(experiment, list(first), baseline)
+    left_out = [name for name in first if name not in chosen]
+    of_chosen = table["configuration"].isin(chosen)
+    truths = [name for name in chosen if experiment.configurations[name].units == TRUTH]
+    shown = [replay.scene.object_number[name] for name in telling(table[of_chosen], truths, SHOWN_OBJECTS)]
+    eye = eye_on(replay, experiment, table, layout.aspect(len(chosen)))
+    blueprint, appearance = layout.blueprint(replay, experiment, table, chosen, shown, eye, baseline)
     # The viewer takes two files of one identity for one recording.
-    identity = digest(experiment.model_dump_json(), replay.scene.log, str(run), run_is)
+    ids = f"copem_replay:{appearance}", digest(experiment.model_dump_json(), replay.scene.log, str(run), run_is)
     strict = rr.strict_mode()
     rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
+    every = configuration_colours(first)  # as in the MCAP, which has all of them
+    colours = {name: every[name] for name in chosen}
+    live = None
     try:
-        with rr.RecordingStream(f"copem_replay:{appearance}", recording_id=identity, send_properties=False) as rec:
-            if not rr.is_enabled(rec):
-                raise OutputError(f"{path}: not written, Rerun is switched off (RERUN=off in the environment?)")
-            # Not `save`: on a full disk it waits for ever, or leaves half a file and says nothing.
-            memory = rec.memory_recording()
-            rec.send_blueprint(blueprint, make_active=False)
-            _fill(
-                Out(rec, replay.scene.t0_ns), replay, experiment, beliefs, table, summary, run, run_is, shown, baseline
-            )
-        with atomic_file(path) as scratch:
-            scratch.write_bytes(memory.drain_as_bytes())
+        with file_stream(path, *ids) as rec:
+            live = Live(viewer, *ids) if viewer is not None else None
+            out = Out(rec, replay.scene.t0_ns, live)
+            rec.send_blueprint(blueprint, make_active=False)  # whoever has changed the layout keeps it
+            if live is not None:
+                live.send(lambda rec: rec.send_blueprint(blueprint, make_active=True))  # else it makes up its own
+            follow(out, replay, experiment, eye)
+            _properties(out, replay, experiment, chosen, run, run_is)
+            _world(out, replay, experiment, table[of_chosen], summary, run, shown, left_out, colours)
+            if len(replay.stretches) == 1:
+                _knowledge(out, replay, experiment, first, table[of_chosen], shown, colours, baseline)
+            for stretch in chain([first], rest):
+                _believed(out, replay, experiment, stretch, shown, colours)
     finally:
         rr.set_strict_mode(strict)
+        if live is not None:
+            live.close()
+    said = []
+    if left_out:
+        said.append(
+            f"{path.name}: without {', '.join(left_out)}; `show: {{configurations: […]}}` chooses up to {VIEWED}"
+        )
+    if len(replay.stretches) > 1:
+        said.append(f"{path.name}: a long log: without words, lines and lanes of why; a window of it has them")
+    if live is not None and live.gone:
+        said.append(f"{path.name}: the viewer at {viewer} went before it had everything; the file is complete")
+    return said
 
 
-def latest_known(table: pd.DataFrame, most: int) -> list[str]:
-    """Ids of the objects that some configuration was last to know (never counts as last), in the table's order."""
-    time_s = table["time_to_detection_s"].fillna(np.inf)
-    worst = time_s.groupby(table["object_id"], sort=False).max()
-    chosen = set(worst.sort_values(ascending=False, kind="stable").index[:most])
-    return [name for name in worst.index if name in chosen]
-
-
-def _fill(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
-    summary: pd.DataFrame, run: int, run_is: str, shown: Sequence[int],
-    baseline: str | None,
+def _world(
+    out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, summary: pd.DataFrame, run: int,
+    shown: Sequence[int], left_out: Sequence[str], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
+    """What was there, and what came of it."""
     import rerun as rr
 
     scene = replay.scene
-    colours = configuration_colours(beliefs)
-    _properties(out, replay, experiment, list(beliefs), run, run_is)
-    out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, world.class_colours())
-    world.truth(out, scene, replay.truth, shown)
+    out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, world.names_and_colours(scene))
+    words.differences(out, replay, table, shown, left_out)
+    words.summary(out, replay, experiment, summary, run, left_out)
+    words.legend(out)
+    words.onsets(out, scene, table)
     world.statics(out, replay.placed.static)
     units.units(out, replay, experiment)
-    sight.sight(out, replay, experiment, shown)
     marks.onsets(out, replay, experiment, table, shown)
+    world.truth(out, scene, replay.truth, shown)
+    for name, colour in colours.items():
+        words.events(out, scene, name, table[table["configuration"] == name])
+        marks.detections(out, replay, experiment, table, name, shown, colour)
+    rows = replay.rows_of(np.array(shown, dtype=np.int64))
     for k in shown:
-        curves = plots.share_curves(replay, experiment, k)
+        curves = plots.share_curves(replay, experiment, rows, k)
         plots.visible_share(out, scene.object_ids[k], curves)
         marks.on_curves(out, replay, experiment, table, scene.object_ids[k], curves, colours)
-    for name, colour in colours.items():
-        world.believed(out, ["world", part_of(name)], scene, beliefs[name], colour)
-        marks.detections(out, replay, experiment, table, name, shown, colour)
-        plots.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
-        words.events(out, name, table[table["configuration"] == name])
     if len(replay.looks.object_ix):
-        plots.known(out, replay, {name: belief.fused for name, belief in beliefs.items()}, colours)
+        plots.known(out, replay, "truth", replay.truth)
+
+
+def _knowledge(
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
+    shown: Sequence[int], colours: Mapping[str, Rgb], baseline: str | None,
+) -> None:  # fmt: skip
+    """Why, and since when: it takes all of the log at once."""
+    seen = sight(replay, experiment, shown)
+    made = {}
+    for name, colour in colours.items():
+        made[name] = status_of(replay, experiment, name, beliefs[name], seen)
+        knowledge.words(out, name, replay, experiment, seen, made[name])
+        knowledge.hiding(out, name, seen, made[name])
+        asked = experiment.configurations[name]
+        knowledge.listings(out, name, replay, experiment, asked, beliefs[name], seen, colour)
+    knowledge.lanes(out, replay.scene, seen, made, colours)
     if baseline is not None:
-        differences.differences(out, replay, experiment, beliefs, table, baseline, shown, colours)
-    words.summary(out, replay, experiment, summary, run)
+        kept = {name: beliefs[name] for name in colours}
+        differences.differences(out, replay, experiment, kept, table, baseline, shown, colours)
+
+
+def _believed(
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], shown: Sequence[int],
+    colours: Mapping[str, Rgb],
+) -> None:  # fmt: skip
+    """What each configuration knew in a stretch, and how far off that was."""
+    for name, colour in colours.items():
+        world.believed(out, ["world", part_of(name)], replay.scene, beliefs[name], colour)
+        plots.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
+        if len(replay.looks.object_ix):
+            plots.gospas(out, replay, experiment, name, beliefs[name], colour)
+            plots.known(out, replay, name, beliefs[name].fused, colour)
 
 
 def _properties(
@@ -109,8 +158,9 @@ def _properties(
 ) -> None:
     import rerun as rr
 
-    out.rec.send_recording_name(f"{replay.scene.log}: run {run}" + (f": {run_is}" if run_is else ""))
-    out.rec.send_recording_start_time_nanos(replay.scene.t0_ns)
+    name = f"{replay.scene.log}: run {run}" + (f": {run_is}" if run_is else "")
+    out.send(lambda rec: rec.send_recording_name(name))
+    out.send(lambda rec: rec.send_recording_start_time_nanos(replay.scene.t0_ns))
     values = rr.AnyValues(
         log=replay.scene.log,
         run=run,
@@ -121,4 +171,4 @@ def _properties(
         copem_replay=version("copem-replay"),
         rerun_sdk=version("rerun-sdk"),
     )
-    out.rec.send_property("replay", values)
+    out.send(lambda rec: rec.send_property("replay", values))

@@ -1,64 +1,128 @@
-"""Lines of sight: which of the shown objects the ego sees, and what hides the others from it."""
+"""How the shown objects look from every modelled unit: in its field of view or not, and what hides them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
-from copem_replay.colours import Rgb
-from copem_replay.experiment import Experiment
+from copem_replay.experiment import Experiment, Unit
+from copem_replay.pem.condition import Condition, Couple
+from copem_replay.pem.look import Look
 from copem_replay.replay import Replay
-from copem_replay.show.out import Out, by_frame, elapsed_ns, f32
-from copem_replay.tracks import Float, Int
-from copem_replay.units import carrier, observers, poses, unit_ground
+from copem_replay.resample import at_instants, wrap
+from copem_replay.show.out import f32
+from copem_replay.tracks import Bool, Float, Int, Tracks
+from copem_replay.units import Poses, carrier, observers, poses, unit_ground
 from copem_replay.visibility import hidden_by, visible_shares
 
 CLEAR_ABOVE = 0.5
 """Seen when more than this share of it is (chosen)."""
-CLEAR: Rgb = (150, 170, 150)
-HIDDEN: Rgb = (255, 70, 60)
 
 
-def sight(out: Out, replay: Replay, experiment: Experiment, shown: Sequence[int]) -> None:
-    """From the ego's first unit (the first of all, if it has none) to each shown object, or to what hides it most."""
-    import rerun as rr
+@dataclass(frozen=True)
+class Sight:
+    """At frames of the truth (K,), of objects (M,), from the experiment's units (U,), those that are modelled.
 
-    if not experiment.modelled or not shown:
-        return
+    `share`: NaN outside the unit's field of view, where it is absent, or carried by the object. `body_ix`: of what is
+    not clearly seen the object that hides most of it, −1 − k: the obstacle k; `body_m` where that is.
+    """
+
+    elapsed_ns: Int
+    object_ix: Int
+    share: Float  # (U, K, M)
+    in_range: Bool  # (U, K, M)
+    body_ix: Int  # (U, K, M)
+    body_m: Float  # (U, K, M, 3)
+    place_m: Float  # (U, K, 3) of the unit
+
+
+def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight:
+    """Computed only at the frames at which one of the shown objects is there."""
     scene, truth = replay.scene, replay.truth
-    carriers = {name: carrier(scene, unit) for name, unit in experiment.modelled.items()}
-    on_ego = [name for name, on in carriers.items() if on == scene.ego_ix >= 0]
-    first = [*on_ego, *carriers][0]
-    unit = experiment.modelled[first]
-    at = poses(scene, unit, truth, unit_ground(truth, first, unit, []))
-    observer, flat = observers([at], np.array([carriers[first]])), experiment.visibility == "flat"
-    [share] = visible_shares(truth, replay.placed.static, observer, flat=flat)
-    [blocker] = hidden_by(truth, replay.placed.static, observer, flat=flat)
-    there = np.isin(truth.row_object_ix, shown) & ~np.isnan(share)  # NaN: the unit is absent, or carried by it
-    # What is hidden is hidden by something: −1 comes with a share of 1.
-    clear, hidden = there & (share > CLEAR_ABOVE), there & (share <= CLEAR_ABOVE)
-    place = f32(at.x_m, at.y_m, at.z_m)
-    centre = f32(truth.x_m[0], truth.y_m[0], truth.z_m[0])
-
-    rows, counts = by_frame(truth, clear)
-    lines = np.stack([place[truth.frame_ix[rows]], centre[rows]], axis=1)
-    out.columns(["world", "sight", "clear"], elapsed_ns(truth), rr.LineStrips3D.columns(strips=lines).partition(counts))
-    thin = rr.Radius.ui_points(0.75)
-    out.static(["world", "sight", "clear"], rr.LineStrips3D.from_fields(colors=[CLEAR], radii=thin))
-
-    rows, counts = by_frame(truth, hidden)
-    bodies = np.concatenate([centre, _obstacle_centres(replay, experiment)])
-    hides = np.where(blocker[rows] >= 0, blocker[rows], len(centre) - 2 - blocker[rows])
-    lines = np.stack([place[truth.frame_ix[rows]], bodies[hides]], axis=1)
-    columns = rr.LineStrips3D.columns(strips=lines, labels=_words(replay, experiment, rows, hides, share[rows]))
-    out.columns(["world", "sight", "hidden"], elapsed_ns(truth), columns.partition(counts))
-    thick = rr.Radius.ui_points(1.5)
-    out.static(
-        ["world", "sight", "hidden"], rr.LineStrips3D.from_fields(colors=[HIDDEN], radii=thick, show_labels=True)
+    stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
+    world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
+    rows, column = _rows(world, shown)
+    frame = world.frame_ix[rows]
+    shape = (len(experiment.units), len(stamps), len(shown))
+    seen = Sight(
+        elapsed_ns=stamps - scene.t0_ns,
+        object_ix=np.array(shown, dtype=np.int64),
+        share=np.full(shape, np.nan),
+        in_range=np.zeros(shape, dtype=bool),
+        body_ix=np.zeros(shape, dtype=np.int64),
+        body_m=np.full((*shape, 3), np.nan),
+        place_m=np.full((*shape[:2], 3), np.nan),
     )
+    obstacles = _obstacle_centres(replay, experiment)
+    for u, (name, unit) in enumerate(experiment.units.items()):
+        if unit.recorded is not None or not len(rows):
+            continue
+        at = poses(scene, unit, world, unit_ground(truth, name, unit, []))
+        watching = observers([at], np.array([carrier(scene, unit)]))
+        [share] = visible_shares(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
+        look = _look(at, world, rows, scene.object_class[world.row_object_ix[rows]])
+        pem = experiment.pems[str(unit.pem)]
+        in_field = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
+        seen.place_m[u] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
+        seen.in_range[u, frame, column] = _anywhere(pem, look, "range_m")
+        seen.share[u, frame, column] = np.where(in_field, share[rows], np.nan)
+        _hidden(replay, experiment, unit, at, seen, u, obstacles)
+    return seen
+
+
+def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
+    """The rows of the shown objects, and which of them each is about."""
+    rows = np.flatnonzero(np.isin(world.row_object_ix, shown))
+    return rows, np.argsort(shown)[np.searchsorted(np.sort(shown), world.row_object_ix[rows])]
+
+
+def _hidden(
+    replay: Replay, experiment: Experiment, unit: Unit, at: Poses, seen: Sight, u: int, obstacles: np.ndarray
+) -> None:
+    """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`."""
+    frames = np.flatnonzero((seen.share[u] <= CLEAR_ABOVE).any(axis=1))
+    if not len(frames):
+        return
+    scene, gap_s = replay.scene, experiment.max_gap_s
+    world = at_instants(replay.truth, scene.t0_ns + seen.elapsed_ns[frames], t0_ns=scene.t0_ns, max_gap_s=gap_s)
+    then = Poses(*(getattr(at, name)[frames] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
+    watching = observers([then], np.array([carrier(scene, unit)]))
+    [hides] = hidden_by(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
+    rows, column = _rows(world, seen.object_ix.tolist())
+    kept = hides[rows] != -1  # nothing hides any of it
+    rows, column = rows[kept], column[kept]
+    count = len(world.frame_ix)
+    body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
+    whose = np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))])
+    where = np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), obstacles])
+    seen.body_ix[u, frames[world.frame_ix[rows]], column] = whose[body]
+    seen.body_m[u, frames[world.frame_ix[rows]], column] = where[body]
+
+
+def _look(at: Poses, world: Tracks, rows: Int, class_ix: np.ndarray) -> Look:
+    """What fields of view ask: range, azimuth and class; of the rest nothing is said."""
+    frames = world.frame_ix[rows]
+    dx, dy = world.x_m[0, rows] - at.x_m[frames], world.y_m[0, rows] - at.y_m[frames]
+    bearing = np.arctan2(dy, dx)
+    nothing = np.full(len(dx), np.nan)
+    rest = dict.fromkeys(Look.__dataclass_fields__, nothing)
+    known = {
+        "range_m": np.hypot(dx, dy),
+        "azimuth_rad": wrap(bearing - at.heading_rad[frames]),
+        "bearing_rad": bearing,
+        "class_ix": class_ix,
+    }
+    return Look(**(rest | known))
+
+
+def _anywhere(pem: tuple[Couple, ...], look: Look, *keys: str) -> Bool:
+    """(P,) where these parts of the condition of some couple hold."""
+    conditions = [Condition(**{key: getattr(couple.when, key) for key in keys}) for couple in pem]
+    with np.errstate(invalid="ignore"):
+        held: Bool = np.any([condition.holds(look) for condition in conditions], axis=0)
+    return held & ~np.isnan(look.range_m)
 
 
 def _obstacle_centres(replay: Replay, experiment: Experiment) -> np.ndarray:
@@ -71,15 +135,3 @@ def _obstacle_centres(replay: Replay, experiment: Experiment) -> np.ndarray:
     middle = shapely.centroid([shapely.Polygon(o.polygon_m) for o in experiment.obstacles])
     _, part = np.unique(static.body, return_index=True)
     return f32(shapely.get_x(middle), shapely.get_y(middle), (static.bottom_m + static.top_m)[part] / 2)
-
-
-def _words(replay: Replay, experiment: Experiment, rows: Int, hides: Int, share: Float) -> pa.Array:
-    """(K,) “2 hidden by 3 (share 0.12)”."""
-    ids = pa.array(replay.scene.object_ids, pa.string())
-    obstacles = pa.array([f"obstacle {k}" for k in range(len(experiment.obstacles))], pa.string())
-    bodies = pa.concat_arrays([ids.take(pa.array(replay.truth.row_object_ix)), obstacles])
-    hundredths = pa.array([f" (share {k / 100:.2f})" for k in range(101)])
-    hidden = ids.take(pa.array(replay.truth.row_object_ix[rows]))
-    shares = hundredths.take(pa.array(np.rint(share * 100).astype(np.int64)))
-    told = pc.binary_join_element_wise(hidden, bodies.take(pa.array(hides)), " hidden by ")
-    return pc.binary_join_element_wise(told, shares, "")

@@ -8,13 +8,15 @@ from copem_replay.colours import Rgb
 from copem_replay.experiment import Experiment, Unit
 from copem_replay.pem.condition import Condition, Couple
 from copem_replay.replay import Replay
+from copem_replay.resample import states_at
 from copem_replay.show.out import Out, f32, upright
 from copem_replay.show.world import EGO
-from copem_replay.units import Poses, list_instants, mounting_height
+from copem_replay.tracks import Float, Tracks
+from copem_replay.units import Poses, carrier, list_instants, mounting_height, unit_ground
 
 MANY_UNITS = 8
 """With more than these the fixed ones are not named (chosen: twenty names cover the scene)."""
-FIELD: Rgb = (95, 95, 75)
+FIELD: Rgb = (72, 72, 60)
 
 _ARC_STEP_RAD = np.deg2rad(3)  # chosen: a chord of 80 m is 3 cm off the arc
 _ABOVE_GROUND_M = 0.05
@@ -24,19 +26,63 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
     """A point and a field of view for each unit; neither while its carrier is absent."""
     import rerun as rr
 
-    many = len(experiment.modelled) > MANY_UNITS
-    for name, unit in experiment.modelled.items():
-        at, path = replay.placed.poses[name], ["world", "units", name]
+    many = len(experiment.units) > MANY_UNITS
+    for name, unit in experiment.units.items():
+        path = ["world", "units", name]
+        mark, named = rr.Radius.ui_points(3), not (many and unit.at is not None)
+        style = rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=named)
+        if unit.recorded is not None:
+            stamps = replay.truth.stamp_ns if unit.on is not None else replay.truth.stamp_ns[:1]
+            place = _recorded_place(replay, experiment, unit, (stamps - replay.scene.t0_ns) * np.float64(1e-9))
+            there = ~np.isnan(place[:, 0])
+            if there.any():
+                columns = rr.Points3D.columns(positions=f32(*place[there].T)).partition(there.astype(np.int64))
+                out.columns(path, stamps - replay.scene.t0_ns, columns)
+                out.static(path, style)
+            continue
+        at = replay.placed.poses[name]
         place, there = f32(at.x_m, at.y_m, at.z_m), at.present
         elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
         if unit.at is not None:
             out.static(path, rr.Points3D.from_fields(positions=place[:1]))
         else:
             out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
-        mark, named = rr.Radius.ui_points(4), not (many and unit.at is not None)
-        out.static(path, rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=named))
+        out.static(path, style)
         height_m = mounting_height(replay.scene, replay.truth, unit)
         _field(out, name, unit, at, elapsed_ns, experiment.pems[str(unit.pem)], height_m)
+
+
+def unit_places(replay: Replay, experiment: Experiment, heard: Tracks) -> Float:
+    """(F, 3) where the unit of each list was at capture; NaN where that is not known, as of the truth."""
+    place = np.full((len(heard.stamp_ns), 3), np.nan)
+    for k, name in enumerate(heard.units):
+        mine = np.flatnonzero(heard.frame_unit_ix == k)
+        if name not in experiment.units or not len(mine):
+            continue
+        unit = experiment.units[name]
+        if unit.recorded is not None:
+            place[mine] = _recorded_place(replay, experiment, unit, heard.captured_s[mine])
+            continue
+        at = replay.placed.poses[name]
+        row = np.searchsorted(list_instants(replay.scene, replay.truth, unit), heard.stamp_ns[mine])
+        place[mine] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)[row]
+    return place
+
+
+def _recorded_place(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
+    """(K, 3) where a unit is whose lists are recorded: on its carrier, or at its place, if it is given."""
+    place = np.full((len(time_s), 3), np.nan)
+    if unit.at is not None:
+        ground_m = unit_ground(replay.truth, "", unit, [])
+        place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))
+    elif unit.on is not None:
+        on = np.full(len(time_s), carrier(replay.scene, unit))
+        at, there = states_at(
+            replay.truth, on, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
+        )  # fmt: skip
+        high_m = at["height_m"] / 2 if unit.height_m is None else unit.height_m - at["height_m"] / 2
+        place[there] = np.stack([at["x_m"], at["y_m"], at["z_m"] + high_m], axis=-1)[there]
+    return place
 
 
 def outlines(pem: tuple[Couple, ...]) -> list[np.ndarray]:

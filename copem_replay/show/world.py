@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
 
 from copem_replay.colours import Rgb
 from copem_replay.fusion.belief import Belief
-from copem_replay.show.out import Out, by_frame, elapsed_ns, f32, object_labels, upright
+from copem_replay.show.out import Out, f32, object_labels, slices, upright
 from copem_replay.tracks import CLASS_GROUPS, CLASSES, Int, Scene, Tracks
 from copem_replay.visibility import Statics
 
@@ -22,42 +21,47 @@ EGO: Rgb = (250, 250, 250)
 SMALLEST_VARIANCE_M2 = 1e-6
 """Positions known better than this have no ellipse (chosen: 2 mm would not be seen)."""
 
-_STANDING, _EGO = 100, 200  # class ids: moving objects have the index of their class
+ALPHAS, STEP_S = (220, 160, 120, 90, 65, 45), 0.2
+"""How opaque a box is, by its age in steps of so much, the last for all that is older (chosen)."""
+
+MOST_NAMES = 65_535
+"""So many kinds of boxes the viewer can tell apart; objects past them share the last one's name."""
+
 _VRU, _VEHICLE, _OTHER = (235, 120, 140), (180, 180, 190), (150, 150, 130)
 
 
-def class_colours() -> rr.AnnotationContext:
-    """Of the log's boxes: by class, darker where stationary."""
+def names_and_colours(scene: Scene) -> rr.AnnotationContext:
+    """A kind of box per object, by its index, and per class what nobody true belongs to: name, and colour in the log.
+
+    By class, darker where stationary. Written once, where a name in every box would be a sixth of the file.
+    """
     import rerun as rr
 
     groups = {"vru": _VRU, "vehicles": _VEHICLE}
     colour_of = {name: colour for group, colour in reversed(groups.items()) for name in CLASS_GROUPS[group]}
-    infos = [rr.AnnotationInfo(_EGO, "ego", EGO)]
-    for k, name in enumerate(CLASSES):
-        colour = colour_of.get(name, _OTHER)
-        infos.append(rr.AnnotationInfo(k, name, colour))
-        infos.append(rr.AnnotationInfo(_STANDING + k, f"{name}, stationary", tuple(c // 2 for c in colour)))
+    infos = []
+    for k, label in enumerate(object_labels(scene).to_pylist()[: MOST_NAMES - len(CLASSES)]):
+        red, green, blue = colour_of.get(CLASSES[scene.object_class[k]], _OTHER)
+        still = 1 if scene.moving[k] else 2
+        colour = EGO if k == scene.ego_ix else (red // still, green // still, blue // still)
+        infos.append(rr.AnnotationInfo(k, label, colour))
+    number = len(scene.object_ids)
+    infos += [rr.AnnotationInfo(_kind(number + k), f"unmatched {name}") for k, name in enumerate(CLASSES)]
     return rr.AnnotationContext(infos)
 
 
+def _kind(number: Any) -> Any:
+    return np.minimum(number, MOST_NAMES).astype(np.uint16)
+
+
 def truth(out: Out, scene: Scene, truth: Tracks, shown: Sequence[int]) -> None:
-    """The log: all boxes; names and paths of the shown objects."""
+    """The log: all boxes; paths of the shown objects and the ego."""
     import rerun as rr
 
-    class_ids = scene.object_class.astype(np.uint16) + np.where(scene.moving, 0, _STANDING).astype(np.uint16)
-    if scene.ego_ix >= 0:
-        class_ids[scene.ego_ix] = _EGO
-    labels = object_labels(scene).take(pa.array(truth.row_object_ix))
-    _boxes(out, ["world", "truth", "boxes"], truth, class_ids[truth.row_object_ix], labels)
+    path = ["world", "truth", "boxes"]
+    _boxes(out, path, truth, lambda rows: {"class_ids": _kind(truth.row_object_ix[rows])})
     wireframe = rr.components.FillMode.MajorWireframe
-    out.static(["world", "truth", "boxes"], rr.Boxes3D.from_fields(fill_mode=wireframe, radii=0.03, show_labels=False))
-    rows, counts = by_frame(truth, np.isin(truth.row_object_ix, shown))
-    above = f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] + truth.height_m[0, rows] / 2 + 2)
-    labels = object_labels(scene).take(pa.array(truth.row_object_ix[rows]))
-    names = rr.Points3D.columns(positions=above, labels=labels)
-    out.columns(["world", "truth", "measured"], elapsed_ns(truth), names.partition(counts))
-    small = rr.Points3D.from_fields(colors=[_VRU], radii=rr.Radius.ui_points(1.5), show_labels=True)
-    out.static(["world", "truth", "measured"], small)
+    out.static(path, rr.Boxes3D.from_fields(fill_mode=wireframe, radii=0.03, show_labels=False))
     out.static(["world", "truth", "paths"], _paths(truth, [*shown, scene.ego_ix]))
 
 
@@ -95,46 +99,48 @@ def statics(out: Out, static: Statics) -> None:
         vertex_positions=np.concatenate([np.stack(corners, axis=1).reshape(-1, 3), corners[3]]),
         vertex_normals=np.concatenate([np.repeat(outward, 4, axis=0), up]),
         triangle_indices=np.concatenate([walls, lid]),
-        albedo_factor=(110, 110, 110),
+        albedo_factor=(110, 110, 110, 100),
     )
     out.static(["world", "static"], mesh)
 
 
 def believed(out: Out, path: list[str], scene: Scene, belief: Belief, colour: Rgb) -> None:
-    """Boxes and ellipses of a configuration's lists."""
+    """Boxes and ellipses of a configuration's lists, paler the older what they show."""
     import rerun as rr
 
-    tracks, class_ix = belief.fused, belief.class_of(scene)
-    _boxes(out, [*path, "boxes"], tracks, class_ix.astype(np.uint16), _labels(belief, scene, class_ix))
+    tracks, captured_s = belief.fused, belief.captured_s[0]
+    object_ix = tracks.row_object_ix
+    kind = _kind(np.where(object_ix >= 0, object_ix, len(scene.object_ids) + belief.class_of(scene)))
+    shades = np.array([_rgba((*colour, alpha)) for alpha in ALPHAS], dtype=np.uint32)
+
+    def more(rows: Int) -> dict[str, Any]:
+        age_s = tracks.arrives_s[0, tracks.frame_ix[rows]] - captured_s[rows]
+        step = np.clip(np.rint(age_s / STEP_S), 0, len(ALPHAS) - 1).astype(np.int64)
+        return {"class_ids": kind[rows], "colors": shades[step]}
+
+    _boxes(out, [*path, "boxes"], tracks, more)
     solid = rr.components.FillMode.TransparentFillMajorWireframe
-    style = rr.Boxes3D.from_fields(colors=[(*colour, 150)], radii=0.04, fill_mode=solid, show_labels=False)
-    out.static([*path, "boxes"], style)
+    out.static([*path, "boxes"], rr.Boxes3D.from_fields(radii=0.04, fill_mode=solid, show_labels=False))
     _covariance(out, [*path, "covariance"], tracks, colour)
 
 
-def _labels(belief: Belief, scene: Scene, class_ix: Int) -> pa.Array:
-    """(P,) what each row is called: its object, or what it is taken for where there is none."""
-    object_ix = belief.fused.row_object_ix
-    if belief.said is None:
-        return object_labels(scene).take(pa.array(object_ix))
-    nobody = pa.array([f"unmatched {name}" for name in CLASSES], pa.string())
-    every = pa.concat_arrays([object_labels(scene), nobody])
-    return every.take(pa.array(np.where(object_ix >= 0, object_ix, len(scene.object_ids) + class_ix)))
+def _rgba(colour: tuple[int, int, int, int]) -> int:
+    red, green, blue, alpha = colour
+    return red << 24 | green << 16 | blue << 8 | alpha
 
 
-def _boxes(out: Out, path: list[str], tracks: Tracks, class_ids: np.ndarray, labels: pa.Array) -> None:
-    """All boxes of `tracks`, list by list, from the instant each list is available. `class_ids` and `labels` (P,)."""
+def _boxes(out: Out, path: list[str], tracks: Tracks, more: Callable[[Int], dict[str, Any]]) -> None:
+    """All boxes of `tracks`, list by list, from the instant each is available. `more`: further columns of rows."""
     import rerun as rr
 
-    rows, counts = by_frame(tracks, tracks.valid[0])
-    columns = rr.Boxes3D.columns(
-        centers=f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
-        half_sizes=f32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,
-        quaternions=upright(tracks.yaw_rad[0, rows]),
-        class_ids=class_ids[rows],
-        labels=labels.take(pa.array(rows)),
-    )
-    out.columns(path, elapsed_ns(tracks), columns.partition(counts))
+    for rows, counts, available_ns in slices(tracks, tracks.valid[0]):
+        columns = rr.Boxes3D.columns(
+            centers=f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
+            half_sizes=f32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,
+            quaternions=upright(tracks.yaw_rad[0, rows]),
+            **more(rows),
+        )
+        out.columns(path, available_ns, columns.partition(counts))
 
 
 def _covariance(out: Out, path: list[str], tracks: Tracks, colour: Rgb) -> None:
@@ -143,19 +149,19 @@ def _covariance(out: Out, path: list[str], tracks: Tracks, colour: Rgb) -> None:
 
     if tracks.cov_ee_m2 is None or tracks.cov_en_m2 is None or tracks.cov_nn_m2 is None:
         return
-    a, b, d = tracks.cov_ee_m2[0], tracks.cov_en_m2[0], tracks.cov_nn_m2[0]
-    turn = np.hypot((a - d) / 2, b)
-    high, low = (a + d) / 2 + turn, (a + d) / 2 - turn
-    rows, counts = by_frame(tracks, tracks.valid[0] & (high > SMALLEST_VARIANCE_M2))
-    if not len(rows):
+    ee, en, nn = tracks.cov_ee_m2[0], tracks.cov_en_m2[0], tracks.cov_nn_m2[0]
+    spread = tracks.valid[0] & ((ee + nn) / 2 + np.hypot((ee - nn) / 2, en) > SMALLEST_VARIANCE_M2)
+    if not spread.any():
         return
-    columns = rr.Ellipsoids3D.columns(
-        centers=f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows] - tracks.height_m[0, rows] / 2),
-        half_sizes=f32(
-            2 * np.sqrt(high[rows]), 2 * np.sqrt(np.maximum(low[rows], SMALLEST_VARIANCE_M2)), np.full(len(rows), 0.01)
-        ),
-        quaternions=upright(np.arctan2(b, (a - d) / 2)[rows] / 2),
-    )
-    out.columns(path, elapsed_ns(tracks), columns.partition(counts))
+    for rows, counts, available_ns in slices(tracks, spread):
+        a, b, d = ee[rows], en[rows], nn[rows]
+        turn = np.hypot((a - d) / 2, b)
+        high, low = (a + d) / 2 + turn, np.maximum((a + d) / 2 - turn, SMALLEST_VARIANCE_M2)
+        columns = rr.Ellipsoids3D.columns(
+            centers=f32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows] - tracks.height_m[0, rows] / 2),
+            half_sizes=f32(2 * np.sqrt(high), 2 * np.sqrt(low), np.full(len(rows), 0.01)),
+            quaternions=upright(np.arctan2(b, (a - d) / 2) / 2),
+        )
+        out.columns(path, available_ns, columns.partition(counts))
     solid = rr.components.FillMode.Solid
-    out.static(path, rr.Ellipsoids3D.from_fields(colors=[(*colour, 70)], fill_mode=solid))
+    out.static(path, rr.Ellipsoids3D.from_fields(colors=[(*colour, 55)], fill_mode=solid))
