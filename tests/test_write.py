@@ -60,7 +60,7 @@ class Written:
 
     def write(self, path: Path, source: Path = SOURCE) -> list[str]:
         manifest = {"experiment": "version: 1", "run": str(RUN)}
-        return write_mcap(path, source, self.replay.scene, self.beliefs, self.table, manifest)
+        return write_mcap(path, source, self.replay.scene, [self.beliefs], self.table, manifest)
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +273,7 @@ def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path)
     family = family_of(written.recording)
     manifest = {"experiment": "version: 1", "run": str(RUN)}
     path = tmp_path / "out.mcap"
-    write_mcap(path, SOURCE, written.replay.scene, written.beliefs, written.table, manifest, family)
+    write_mcap(path, SOURCE, written.replay.scene, [written.beliefs], written.table, manifest, family)
     assert path.read_bytes() == written.path.read_bytes()
     with path.open("rb") as file:
         reader = make_reader(file)

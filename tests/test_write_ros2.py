@@ -192,7 +192,7 @@ class Written:
             path,
             source or self.source,
             self.replay.scene,
-            self.beliefs,
+            [self.beliefs],
             self.table,
             {"run": "0"},
             family_of(self.recording),
@@ -382,7 +382,7 @@ def test_names_of_any_length_do_not_shift_what_follows(written: Written, tmp_pat
     (tmp_path / "e.yaml").write_text(EXPERIMENT)
     recording = read(source, name="drive", ego=written.experiment.ego)
     target = tmp_path / "out.mcap"
-    write_mcap(target, source, written.replay.scene, written.beliefs, written.table, {}, family_of(recording))
+    write_mcap(target, source, written.replay.scene, [written.beliefs], written.table, {}, family_of(recording))
     lists = [m for _, _, m in decoded(target) if hasattr(m, "header")]
     assert {m.header.frame_id for m in lists} == {frame_id.lstrip("/") or "map"}
     assert sum(len(m.objects) for m in lists) == sum(int(b.fused.valid.sum()) for b in written.beliefs.values())

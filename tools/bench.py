@@ -145,7 +145,7 @@ def writing() -> Iterator[dict[str, object]]:
     shown = listed + len(ready.truth.frame_ix)
     with _scratch() as folder:
         mcap, rrd = folder / "w.mcap", folder / "w.rrd"
-        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, beliefs, table, {}), 1)
+        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, [beliefs], table, {}), 1)
         yield {"mcap_objects_per_s": round(listed / seconds)}
         seconds = best(lambda: write_rrd(rrd, ready, experiment, [beliefs], table, rows, 0), 3)
         yield {
