@@ -25,6 +25,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
 import bench_fusion  # noqa: E402
+import bench_long  # noqa: E402
 import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
@@ -209,3 +210,10 @@ def test_the_table_is_the_papers() -> None:
         assert at_least <= rows["pass_share"][name] * 500 <= at_most, name
     order = ["GT", "coPEM:0s", "coPEM:0.5s", "PEM", "coPEM:1s", "coPEM:1.5s"]
     assert (np.diff([exact[name] for name in order]) <= 1e-12).all()
+
+
+def test_a_long_recording_is_timed(tmp_path: Path) -> None:
+    """Here it is short: what grows how is for the benchmark to say."""
+    short, longer, slope = bench_long.long(tmp_path, minutes=(0.05, 0.1), objects=8)
+    assert (short["object_states"], longer["object_states"]) == (240, 480)
+    assert all(value > 0 for line in (short, longer, slope) for value in line.values())

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 import bench_fusion
+import bench_long
 import bench_read
 import bench_viewer
 from copem_replay.check import problems, read_logs
@@ -196,6 +197,12 @@ def _loaded(path: Path):
     return experiment, recordings
 
 
+def long() -> Iterator[dict[str, object]]:
+    """An hour of recording, and a quarter of it; see bench_long.py. It takes a quarter of an hour."""
+    with _scratch() as folder:
+        yield from bench_long.long(folder)
+
+
 @contextmanager
 def _scratch() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
@@ -247,7 +254,7 @@ def _plain_loop(path: Path) -> int:
     return len(pd.DataFrame(rows))
 
 
-BENCHES = (visibility, paper, reading, writing, commands, fusion, peers)
+BENCHES = (visibility, paper, reading, writing, commands, fusion, peers, long)
 
 if __name__ == "__main__":
     main(sys.argv[1:])

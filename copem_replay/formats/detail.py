@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import orjson
 
 from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Bool, Scene
 
@@ -62,10 +63,9 @@ class DetailWriter:
         fused, heard, used = belief.fused, belief.heard, belief.used
         self._fused, self._listed, self._events = fused, belief.listed, events
         self._ids = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
-        self._variances = {
-            name: [None] * len(fused.frame_ix) if (a := getattr(fused, name)) is None else a[0].tolist()
-            for name in UNCERTAINTIES
-        }
+        unsaid = [None] * len(fused.frame_ix)
+        variances = (getattr(fused, name) for name in UNCERTAINTIES)
+        self._variances = list(zip(*(unsaid if a is None else a[0].tolist() for a in variances), strict=True))
         nothing: list[float | None] = [None] * len(used)
         self._entries: dict[str, list[Any]] = {
             "units": [heard.units[k] for k in heard.row_unit_ix[used]],
@@ -86,7 +86,7 @@ class DetailWriter:
             "objects": [self._object(row) for row in self._listed(frame)],
             "events": list(self._events.get(frame, ())),
         }
-        return json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=False).encode()
+        return orjson.dumps(content)
 
     def _object(self, row: int) -> dict[str, Any]:
         first, last = self._start[row], self._start[row + 1]
@@ -96,7 +96,7 @@ class DetailWriter:
             "id": self._ids[row],
             **claimed,
             **{name: float(getattr(self._fused, name)[0, row]) for name in sides},
-            **{name: values[row] for name, values in self._variances.items()},
+            **dict(zip(UNCERTAINTIES, self._variances[row], strict=True)),
             **{name: values[first:last] for name, values in self._entries.items()},
         }
 
