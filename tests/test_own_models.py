@@ -13,6 +13,7 @@ from copem_replay.pem.detection import DetectionModel
 from copem_replay.pem.error import ErrorModel
 from copem_replay.pem.look import Errors, Look, Noise
 from copem_replay.replay import believed, prepare
+from copem_replay.stretches import WHOLE
 from scenes import experiment
 
 
@@ -79,7 +80,7 @@ def test_own_models_are_used() -> None:
 )
 def test_a_detection_model_that_fails_is_named(kind: str, said: str) -> None:
     with pytest.raises(InputError, match=rf"^pems\.sure\[0\]\.detection: test_own_models:{kind}: .*{said}"):
-        prepare(scenes.oncoming_car(), plan({"kind": f"test_own_models:{kind}"}))
+        prepare(scenes.oncoming_car(), plan({"kind": f"test_own_models:{kind}"})).found(WHOLE)
 
 
 def test_an_error_model_that_fails_is_named() -> None:
