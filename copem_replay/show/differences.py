@@ -28,7 +28,7 @@ from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 GAINED: Rgb = (0, 158, 115)
 LOST: Rgb = (213, 94, 0)
 """Bluish green and vermillion, told apart by colour-blind readers (Okabe & Ito 2008)."""
-_ABOVE_M, _MARK_POINTS = 3.0, 7
+_ABOVE_M, _MARK_POINTS = 4.5, 7
 """How far marks are above a box, clear of its name, and how large they are (chosen)."""
 
 

@@ -118,6 +118,7 @@ def _objects(replay: Replay, shown: Sequence[int], baseline: str | None) -> rrb.
     import rerun.blueprint as rrb
 
     scene, plots = replay.scene, []
+    none = rrb.PlotLegend(visible=False)  # the lanes say which colour is whose
     for k in shown:
         there_s = replay.truth.row_captured_s[replay.truth.row_object_ix == k]
         stay = _axis(float(there_s.min()), float(there_s.max()))
@@ -125,20 +126,22 @@ def _objects(replay: Replay, shown: Sequence[int], baseline: str | None) -> rrb.
         share = rrb.TimeSeriesView(
             origin=path_of("plots", "visible_share", name),
             name="Visible share (ego white, any unit grey)",
-            plot_legend=rrb.PlotLegend(visible=False),
+            plot_legend=none,
             axis_x=stay,
             axis_y=rrb.ScalarAxis(range=(-0.05, 1.05)),
         )
         error = rrb.TimeSeriesView(
             origin=path_of("plots", "position_error", name),
             name="Position error [m]",
-            plot_legend=rrb.PlotLegend(visible=False),
+            plot_legend=none,
             axis_x=stay,
         )
         views = [share, error]
         if baseline is not None:
             more = path_of("plots", "error_difference", name)
-            views.append(rrb.TimeSeriesView(origin=more, name=f"More error than {baseline} [m]", axis_x=stay))
+            views.append(
+                rrb.TimeSeriesView(origin=more, name=f"More error than {baseline} [m]", axis_x=stay, plot_legend=none)
+            )
         plots.append(rrb.Horizontal(*views, name=f"{short_ids(scene)[k]} {CLASSES[scene.object_class[k]]}"))
     return rrb.Tabs(*plots)
 
@@ -147,7 +150,6 @@ def _lists(whole: rrb.TimeAxis) -> rrb.Horizontal:
     """Curves over all measured objects."""
     import rerun.blueprint as rrb
 
-    # The lanes say which colour is whose: a legend would cover the curves.
     none = rrb.PlotLegend(visible=False)
     return rrb.Horizontal(
         rrb.TimeSeriesView(origin="plots/gospa", name="GOSPA [m]", axis_x=whole, plot_legend=none),
