@@ -144,7 +144,14 @@ def _show(
         "run_is": shown.why,
     }
     said = write_mcap(
-        Path(f"{target}.mcap"), recording.path, one.replay.scene, one.beliefs, rows, manifest, family_of(recording)
+        Path(f"{target}.mcap"),
+        recording.path,
+        one.replay.scene,
+        one.beliefs,
+        rows,
+        manifest,
+        family_of(recording),
+        recording.window,
     )
     write_rrd(
         Path(f"{target}.rrd"),
@@ -180,6 +187,7 @@ def provenance_of(
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility,
         "max_gap_s": experiment.max_gap_s,
+        "window_s": experiment.window_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
         "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
         "run_shown": {log: runs[0].run for log, runs in shown.items()},
