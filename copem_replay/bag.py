@@ -18,6 +18,7 @@ from copem_replay.bag_metadata import files_of, unnamed_in
 from copem_replay.container import BrokenIndexError, Channel, Log, from_start, open_mcap
 from copem_replay.errors import RecordingError
 from copem_replay.indexed import renumbered
+from copem_replay.window import Window, overlap
 from copem_replay.wording import counted
 
 
@@ -44,9 +45,15 @@ class Bag(Log):
         streams: list[tuple[int, Callable[[], Iterator[Message]]]] = []
         for part in self.parts:
             mine = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
-            if any(c.messages for c in part.log.channels if c.number in mine):
+            there = {c.number for c in part.log.channels if c.number in mine and c.messages}
+            if overlap(part.log.spans(there).values(), part.log.start_ns, part.log.end_ns):
                 streams.append((part.log.start_ns, _Renumbered(part.log, mine).__iter__))
         yield from merged(streams)
+
+    def within(self, window: Window | None) -> Log:
+        """The same folder, of which only a window is read, file by file."""
+        parts = tuple(replace(part, log=part.log.within(window)) for part in self.parts)
+        return replace(self, window=window, parts=parts)
 
     def from_start(self, error: BrokenIndexError) -> Log:
         """The same, every file read from its start. Raises RecordingError."""
@@ -58,7 +65,7 @@ class Bag(Log):
                 logs.append(from_start(log.path, why, log.channels) if log.indexed else log)
             except RecordingError as found:
                 lost.append(_of_file(log.path, str(found)))
-        return _joined(self.path, logs, lost, self.notes)
+        return _joined(self.path, logs, lost, self.notes).within(self.window)
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,7 @@ def _joined(folder: Path, logs: Sequence[Log], lost: Sequence[str], notes: tuple
         complete=not lost and all(log.complete for log in logs),
         went_on=bool(lost) or any(log.went_on or log.start_ns < last for log in logs if not log.complete),
         start_ns=min(log.start_ns for log in logs),
+        end_ns=max(log.end_ns for log in logs),
         notes=notes,
         parts=tuple(parts),
         lost=tuple(lost),

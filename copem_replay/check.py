@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from copem_replay.container import name_of
-from copem_replay.errors import RecordingError
+from copem_replay.errors import EmptyWindowError, RecordingError
 from copem_replay.experiment import Carriers, Experiment, ReadFields
 from copem_replay.experiment_file import Source, is_there, log_paths, parse
 from copem_replay.plain_yaml import Key
@@ -97,23 +98,27 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
     wrong: list[Refused] = []
     fields = experiment.read if isinstance(experiment.read, ReadFields) else None
     beside = {asked.topic for asked in experiment.recorded.values()}
+    how = partial(
+        read, path, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside,
+        window_s=experiment.window_s,
+    )  # fmt: skip
     try:
-        recording = read(path, name=name_of(path), ego=ego, topic=experiment.read.topic, fields=fields, beside=beside)
+        recording = how(ego=ego)
+    except EmptyWindowError as error:
+        return None, [Refused(path, line.removeprefix(f"{path}: "), ("window_s",)) for line in error.problems]
     except RecordingError as error:
         reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
         if not reasons[0].startswith("ego: "):
             key = ("read", "topic") if "no true objects on topic" in reasons[0] else None
             return None, [Refused(path, reason, key) for reason in reasons]
         wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
-        recording = read(
-            path, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside
-        )  # for what else is wrong
+        recording = how()  # for what else is wrong
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
     lists, notes = {}, list(recording.notes)
     for name, asked in experiment.recorded.items():
         try:
-            lists[name], said = recorded_unit(path, recording.scene, name, asked, recording.around)
+            lists[name], said = recorded_unit(recording, name, asked)
             notes += said
         except RecordingError as error:
             at = ("units", name, "recorded")

@@ -99,9 +99,15 @@ def check(
     experiment: ExperimentFile,
     log: Annotated[list[Path] | None, typer.Option(help="Check against this recording instead of those named.")] = None,
     ego: Annotated[str | None, typer.Option(metavar="ID", help="Object that is the ego vehicle.")] = None,
+    from_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Read what was logged from this instant on [the first].")
+    ] = None,
+    to_s: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Read what was logged up to this instant [the last].")
+    ] = None,
 ) -> int:
     """Every problem of an experiment file at once, with file and line, against its logs too."""
-    source = _source(experiment, {} if ego is None else {"ego": ego}, log or [])
+    source = _source(experiment, {"ego": ego}, log or [], (from_s, to_s))
     wanted, recordings, _skipped = _ready(source, skip_unreadable=False)
     if wanted.measure.exact and wanted.measure.confirm.hits > 1:  # whether that can be done shows with the lists
         from copem_replay.errors import ExperimentError
@@ -121,6 +127,12 @@ def run(
     experiment: ExperimentFile,
     log: Annotated[list[Path] | None, typer.Option(help="Replay this recording instead of those named.")] = None,
     ego: Annotated[str | None, typer.Option(metavar="ID", help="Object that is the ego vehicle.")] = None,
+    from_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Read what was logged from this instant on [the first].")
+    ] = None,
+    to_s: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Read what was logged up to this instant [the last].")
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Results folder [out/<experiment>].")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Number of runs.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
@@ -139,8 +151,7 @@ def run(
     from copem_replay.results import check_target, write_results
     from copem_replay.table import summary_text
 
-    changes = {"ego": ego, "runs": runs, "seed": seed}
-    source = _source(experiment, {k: v for k, v in changes.items() if v is not None}, log or [])
+    source = _source(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or [], (from_s, to_s))
     folder = out or Path("out") / experiment.stem
     check_target(folder, overwrite=overwrite)
     ready, recordings, skipped = _ready(source, skip_unreadable=skip_unreadable)
@@ -289,15 +300,25 @@ def schema() -> int:
     return 0
 
 
-def _source(path: Path, changes: dict[str, Any], logs: Sequence[Path]) -> Any:
-    """The experiment file, with what the options say instead."""
+def _source(
+    path: Path, changes: dict[str, Any], logs: Sequence[Path], window_s: tuple[float | None, float | None]
+) -> Any:
+    """The experiment file, with what the options say instead where they are given."""
     from dataclasses import replace
 
     from copem_replay.experiment_file import load
 
     source = load(path)
+    changes = {name: value for name, value in changes.items() if value is not None}
     source.data.update(changes)
-    source = replace(source, options=frozenset(changes))
+    options: dict[Any, str] = {(name,): f"--{name}" for name in changes}
+    ends = {k: option for k, option in enumerate(("--from", "--to")) if window_s[k] is not None}
+    if ends:
+        said = source.data.get("window_s")
+        window = said if isinstance(said, list) and len(said) == len(window_s) else [None, None]
+        source.data["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
+        options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
+    source = replace(source, options=options)
     if not logs:
         return source
     source.data["logs"] = [str(log) for log in logs]

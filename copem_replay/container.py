@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator, Set
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,6 +25,7 @@ from copem_replay.errors import RecordingError
 from copem_replay.indexed import in_order, summary_of
 from copem_replay.not_mcap import check_magic
 from copem_replay.salvage import FromStart
+from copem_replay.window import ALWAYS, Span, Window, kept
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Log:
     """A recording that was looked at: an MCAP file; other containers do the same in their own way.
 
     `damage` says what is wrong with the file, None where nothing is; `complete` whether all messages can be
-    read all the same. `notes`: what else is to be said of the container.
+    read all the same. `notes`: what else is to be said of the container. Counts of messages are those of the whole
+    recording, whatever the `window`.
     """
 
     path: Path
@@ -64,7 +66,20 @@ class Log:
     complete: bool = True
     went_on: bool = False  # whether messages after the damage were read
     start_ns: int = 0  # log time of the first message
+    end_ns: int = ALWAYS[1]  # and of the last one
     notes: tuple[str, ...] = ()
+    window: Window | None = None  # what is read of it, None: all
+
+    def within(self, window: Window | None) -> Log:
+        """The same recording, of which only a window is read."""
+        return replace(self, window=window)
+
+    def spans(self, numbers: Set[int]) -> dict[int, Span]:
+        """What is read of some channels, by their numbers."""
+        if self.window is None:
+            return dict.fromkeys(numbers, ALWAYS)
+        known = {c.number: self.window.span(c) for c in self.channels if c.number in numbers}
+        return dict.fromkeys(numbers, (self.window.from_ns, self.window.to_ns)) | known
 
     def payloads(self, numbers: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
         """Messages of some channels: channel number, log time in ns, payload. As `messages`."""
@@ -76,27 +91,28 @@ class Log:
 
         Raises BrokenIndexError.
         """
+        spans = self.spans(numbers)
         with open_file(self.path) as file:
-            for message in self._by_index(file, numbers) if self.indexed else FromStart(file):
-                if isinstance(message, Message) and message.channel_id in numbers:
+            for message in self._by_index(file, spans) if self.indexed else FromStart(file):
+                if isinstance(message, Message) and kept(spans, message.channel_id, message.log_time):
                     yield message
 
     def from_start(self, error: BrokenIndexError) -> Log:
         """The same recording, read without the index that turned out to be broken. Raises RecordingError."""
-        return from_start(self.path, error.__cause__, self.channels)
+        return from_start(self.path, error.__cause__, self.channels).within(self.window)
 
-    def _by_index(self, file: IO[bytes], numbers: Set[int]) -> Iterator[Message]:
+    def _by_index(self, file: IO[bytes], spans: Mapping[int, Span]) -> Iterator[Message]:
         """Messages in order of log time. Raises BrokenIndexError, also where there are not as many as promised."""
-        promised = sum(c.messages for c in self.channels if c.number in numbers)
+        promised = sum(c.messages for c in self.channels if c.number in spans)
         found = 0
         try:
             summary = summary_of(file)
             if summary is None:
                 raise ValueError("the index is gone")
-            for message in in_order(file, summary, numbers):
+            for message in in_order(file, summary, spans):
                 found += 1
                 yield message
-            if found != promised:
+            if found != promised and self.window is None:  # of a window nobody says how many there are
                 raise ValueError(f"the index promises {promised} messages, and there are {found}")
         except DAMAGE as error:
             raise BrokenIndexError(self.path) from without_trace(error)
@@ -148,7 +164,8 @@ def open_mcap(path: Path) -> Log:
             summary = summary_of(file)
             if summary is not None and _index_is_sound(summary):
                 start_ns = min((c.message_start_time for c in summary.chunk_indexes), default=0)
-                return Log(path, _channels_of(summary), indexed=True, start_ns=start_ns)
+                end_ns = max((c.message_end_time for c in summary.chunk_indexes), default=0)
+                return Log(path, _channels_of(summary), indexed=True, start_ns=start_ns, end_ns=end_ns)
         except DAMAGE as error:
             return from_start(path, error)
     return from_start(path)
@@ -161,13 +178,13 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
     is damage and no message before it.
     """
     counts: Counter[int] = Counter()
-    start_ns = 1 << 64
+    start_ns, end_ns = 1 << 64, 0
     with open_file(path) as file:
         stream = FromStart(file)
         for record in stream:
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
-                start_ns = min(start_ns, record.log_time)
+                start_ns, end_ns = min(start_ns, record.log_time), max(end_ns, record.log_time)
     expected = {c.number: c.messages for c in promised}
     channels = tuple(
         _channel(number, channel, stream.schemas.get(channel.schema_id), counts[number], expected.get(number))
@@ -191,6 +208,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
         complete=stream.complete,
         went_on=stream.went_on,
         start_ns=start_ns,
+        end_ns=end_ns,
     )
 
 

@@ -4,6 +4,7 @@
     ├── InputError            what was given is wrong: one line per problem, exit code 2
     │   ├── ExperimentError   … in an experiment file (file:line: key: …)
     │   └── RecordingError    … in a recording (file: …)
+    │       └── EmptyWindowError
     └── OutputError           what was asked for cannot be written, exit code 2
 
 Anything else that escapes is a defect of this project: traceback, exit code 70.
@@ -38,6 +39,10 @@ class ExperimentError(InputError):
 
 class RecordingError(InputError):
     """A recording cannot be read or replayed."""
+
+
+class EmptyWindowError(RecordingError):
+    """Nothing of a recording is in the window that was asked for."""
 
 
 class OutputError(CopemError):

@@ -256,13 +256,24 @@ class Show(Frozen):
         return () if self.run is None else (self.run,)
 
 
+def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
+    from_s, to_s = window_s
+    if from_s is not None and to_s is not None and from_s > to_s:
+        raise ValueError(f"expected [from, to], found one that ends ({to_s:g} s) before it begins ({from_s:g} s)")
+    return window_s
+
+
 class Experiment(Frozen):
-    """An experiment file."""
+    """An experiment file.
+
+    `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
+    """
 
     version: Annotated[Literal[1], BeforeValidator(_version)]
     logs: Annotated[tuple[str, ...], Field(min_length=1)]
     read: HowRead = Read()
     ego: Ego | None = None
+    window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1
     seed: Annotated[int, Field(strict=True)] = 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import glob
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,15 @@ class Source:
     lines: dict[Key, int]
     problems: tuple[str, ...]  # of its YAML: the file is refused, but the rest is checked all the same
     logs: tuple[str, ...] = ()  # to replay instead of those it names, relative to where we are
-    options: frozenset[str] = frozenset()  # top-level keys that an option of the command line has set
+    options: Mapping[Key, str] = field(default_factory=dict)  # of the command line: keys that they have set
 
     def at(self, key: Key, message: str, line: int | None = None) -> str:
         """`file:line: key: message`; by default the line of the key, or of what it should be in.
 
         Where an option set the key, `--option: message`.
         """
-        if key and key[0] in self.options:
-            return f"--{key[0]}: {message}"
+        if key in self.options:
+            return f"{self.options[key]}: {message}"
         if line is None:
             line = next(self.lines[key[:n]] for n in range(len(key), -1, -1) if key[:n] in self.lines)
         name = dotted(key)

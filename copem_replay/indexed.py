@@ -6,7 +6,7 @@ import heapq
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from io import BytesIO
 from typing import IO
 
@@ -25,6 +25,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
 from copem_replay.chunks import HEAD, MAGIC, RECORD_LIMIT_BYTES, Allowance, in_chunk, record_at
+from copem_replay.window import Span, kept, overlap
 
 _FOOTER = struct.Struct("<QQI")  # summary_start, summary_offset_start, summary_crc
 _HELD_LIMIT_BYTES = 1 << 29
@@ -75,15 +76,14 @@ def _parsed(section: bytes) -> Summary:
     return summary
 
 
-def in_order(file: IO[bytes], summary: Summary, numbers: Set[int]) -> Iterator[Message]:
-    """Messages of some channels in order of log time, of equal ones as in the file. Raises DAMAGE."""
+def in_order(file: IO[bytes], summary: Summary, spans: Mapping[int, Span]) -> Iterator[Message]:
+    """Messages of some channels in order of log time, of equal ones as in the file. Raises DAMAGE.
+
+    `spans`: which, by channel; chunks that hold none of them are not opened.
+    """
     if any(number not in summary.channels for c in summary.chunk_indexes for number in c.message_index_offsets):
         raise ValueError("the index lacks a channel")
-    chunks = {
-        c.chunk_start_offset: c
-        for c in summary.chunk_indexes
-        if not c.message_index_offsets or numbers & c.message_index_offsets.keys()
-    }
+    chunks = {c.chunk_start_offset: c for c in summary.chunk_indexes if _may_hold(c, spans)}
     waiting: list[tuple[int, int, int, Message | None]] = [
         (c.message_start_time, offset, -1, None) for offset, c in chunks.items()
     ]
@@ -100,11 +100,16 @@ def in_order(file: IO[bytes], summary: Summary, numbers: Set[int]) -> Iterator[M
                 continue
             if record.channel_id not in summary.channels:
                 raise ValueError("the index lacks a channel")
-            if record.channel_id in numbers:
+            if kept(spans, record.channel_id, record.log_time):
                 held += len(record.data)
                 if held > _HELD_LIMIT_BYTES:
                     raise ValueError("its chunks overlap in time")
                 heapq.heappush(waiting, (record.log_time, offset, place, record))
+
+
+def _may_hold(chunk: ChunkIndex, spans: Mapping[int, Span]) -> bool:
+    numbers = spans.keys() & chunk.message_index_offsets.keys() if chunk.message_index_offsets else spans.keys()
+    return overlap((spans[n] for n in numbers), chunk.message_start_time, chunk.message_end_time)
 
 
 def renumbered(message: Message, numbers: Mapping[int, int]) -> Message:

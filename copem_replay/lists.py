@@ -20,6 +20,7 @@ from copem_replay.formats import detail, osi, sensor_data
 from copem_replay.formats.columns import LAST_NS
 from copem_replay.resample import wrap
 from copem_replay.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
+from copem_replay.window import Window
 
 _LARGEST_ID = 2**63 - 1
 """OSI's identifiers are unsigned: what is beyond the signed ones is brought among them."""
@@ -67,9 +68,9 @@ class RecordedLists:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def read_recorded(path: Path, topic: str, scene: Scene) -> RecordedLists:
+def read_recorded(path: Path, topic: str, scene: Scene, window: Window | None = None) -> RecordedLists:
     """The lists on `topic` with all they say, but ids of the truth. Raises RecordingError as `read_lists`."""
-    rows, _ = _all_rows(path, topic)
+    rows, _ = _all_rows(path, topic, window)
     stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
     by_time = np.argsort(stamps[:, 1], kind="stable")
     place = np.empty_like(by_time)
@@ -107,8 +108,8 @@ def read_recorded(path: Path, topic: str, scene: Scene) -> RecordedLists:
     )
 
 
-def _all_rows(path: Path, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
-    log = container.open_log(path)
+def _all_rows(path: Path, topic: str, window: Window | None = None) -> tuple[_Rows, dict[int, dict[str, Any]]]:
+    log = container.open_log(path).within(window)
     try:
         return _read(log, topic)
     except container.BrokenIndexError as error:

@@ -20,6 +20,7 @@ from copem_replay.families import OSI_CHANNEL, osi_version
 from copem_replay.indexed import renumbered
 from copem_replay.passthrough import Catalogue, Original
 from copem_replay.trace import Trace, message_class
+from copem_replay.window import Window
 
 
 class Source(Protocol):
@@ -34,12 +35,12 @@ class Source(Protocol):
         """Put schemas, channels and attachments into the output, but for some topics."""
 
     def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        """All messages in order of log time, with the channel numbers of the output."""
+        """The messages in order of log time, with the channel numbers of the output."""
 
 
-def source_of(path: Path) -> Source:
-    """What can be copied of a recording. Raises RecordingError where nothing can be read."""
-    log = open_log(path)
+def source_of(path: Path, window: Window | None = None) -> Source:
+    """What can be copied of a recording, or of a window of it. Raises RecordingError where nothing can be read."""
+    log = open_log(path).within(window)
     if isinstance(log, Bag):
         return _OfBag(log)
     return _OfTrace(log) if isinstance(log, Trace) else Original(log)

@@ -1,5 +1,7 @@
 """An MCAP file on its way into the output: every channel, message, metadata record and attachment as it was.
 
+Of a window only what is read of it is copied, channels, records and attachments wholly.
+
 A sound file comes in order of log time through its index; a damaged one is read from its start as far as it goes, and
 sorted.
 """
@@ -16,6 +18,7 @@ from copem_replay.chunks import DAMAGE, MAGIC, parsed, record_at
 from copem_replay.container import Log, open_file
 from copem_replay.indexed import in_order, renumbered, summary_of
 from copem_replay.salvage import FromStart
+from copem_replay.window import kept
 
 
 class Catalogue:
@@ -56,7 +59,7 @@ class Original:
     """
 
     def __init__(self, log: Log) -> None:
-        self._path = log.path
+        self._log = log
         self.damage: str | None = None
         self.profile = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -71,9 +74,9 @@ class Original:
                 self.damage = "damaged: its messages are copied as far as they can be read"
 
     def _look_up(self) -> bool:
-        """Whether the file can be copied through its index: all of it is read once, for only that tells."""
+        """Whether the file can be copied through its index: all that is copied is read once, for only that tells."""
         try:
-            with open_file(self._path) as file:
+            with open_file(self._log.path) as file:
                 summary = summary_of(file)
                 if summary is None:
                     return False
@@ -86,7 +89,7 @@ class Original:
                     parsed(Opcode.ATTACHMENT, record_at(file, index.offset, Opcode.ATTACHMENT))
                     for index in summary.attachment_indexes
                 ]
-                for _message in in_order(file, summary, summary.channels.keys()):
+                for _message in in_order(file, summary, self._log.spans(summary.channels.keys())):
                     pass
         except DAMAGE:
             return False
@@ -100,7 +103,7 @@ class Original:
         return True
 
     def _salvage(self) -> None:
-        with open_file(self._path) as file:
+        with open_file(self._log.path) as file:
             stream = FromStart(file)
             for record in stream:
                 if isinstance(record, Header):
@@ -130,12 +133,13 @@ class Original:
         return numbers
 
     def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        """All messages in order of log time, with the channel numbers of the output."""
-        with open_file(self._path) as file:
+        """The messages in order of log time, with the channel numbers of the output."""
+        spans = self._log.spans(numbers.keys())
+        with open_file(self._log.path) as file:
             if self._by_index and (summary := summary_of(file)) is not None:
-                found = in_order(file, summary, numbers.keys())
+                found = in_order(file, summary, spans)
             else:
-                there = (r for r in FromStart(file) if isinstance(r, Message) and r.channel_id in numbers)
+                there = (r for r in FromStart(file) if isinstance(r, Message) and kept(spans, r.channel_id, r.log_time))
                 found = iter(sorted(there, key=lambda message: message.log_time))
             for message in found:
                 yield renumbered(message, numbers)

@@ -20,6 +20,7 @@ from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
 from copem_replay.formats.columns import Columns
 from copem_replay.tracks import CLASSES, Scene, Tracks
+from copem_replay.window import Window, WindowSeconds, cut_out, window_notes
 from copem_replay.wording import counted, printable
 
 if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
@@ -50,6 +51,7 @@ class Recording:
     around: Surroundings | None = None  # frames of reference, where lists other than OSI's are read
     encoding: str = "protobuf"  # of the messages of the truth
     world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
+    window: Window | None = None  # of log time, that was read; None: all
 
 
 def read(
@@ -60,16 +62,20 @@ def read(
     topic: str | None = None,
     fields: Fields | None = None,
     beside: Collection[str] = (),
+    window_s: WindowSeconds = None,
 ) -> Recording:
     """Read the truth of the recording at `path`, as the log called `name`.
 
     `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
     odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
     have what, None where that is known. `beside`: topics that somebody else reads.
+    `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
+    on the topic of the truth was logged; None: from the beginning, to the end.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
-    or several.
+    or several; EmptyWindowError.
     """
-    return read_log(container.open_log(Path(path)), name=name, ego=ego, topic=topic, fields=fields, beside=beside)
+    log = container.open_log(Path(path))
+    return read_log(log, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
@@ -81,33 +87,38 @@ def read_log(
     topic: str | None = None,
     fields: Fields | None = None,
     beside: Collection[str] = (),
+    window_s: WindowSeconds = None,
 ) -> Recording:
     """Do the same with a log that was opened before."""
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:
+        log = cut_out(log, topic, window_s)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     except container.BrokenIndexError as error:
-        log = log.from_start(error)
+        log = cut_out(log.from_start(error), topic, window_s)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     scene, truth, found = assemble(columns, name)
     notes = [*columns.notes, *found]
     if scene is None or truth is None:
-        read_messages = sum(c.messages for c in log.channels if c.topic == topic)
+        messages = counted(sum(c.messages for c in log.channels if c.topic == topic), "message")
+        inside = "the window" if log.window is not None else messages
         damage = _damage(log, topic, None)
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
-        raise RecordingError(f"{log.path}: {topic}: no usable object in {counted(read_messages, 'message')}{why}")
+        raise RecordingError(f"{log.path}: {topic}: no usable object in {inside}{why}")
     host, said = _host(columns.hosts)
     ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _damage(log, topic, scene.end_s)
-    notes = [*([damage] if damage else []), *log.notes, *ignored, *notes, *said, *more]
+    cut = window_notes(window_s)
+    notes = [*([damage] if damage else []), *cut, *log.notes, *ignored, *notes, *said, *more]
     sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized)
     said_all = tuple(printable(note) for note in notes)
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
-        scene, truth, log.path, topic, said_all, host, damage, around=around, encoding=encoding, world=world
-    )
+        scene, truth, log.path, topic, said_all, host, damage,
+        around=around, encoding=encoding, world=world, window=log.window,
+    )  # fmt: skip
 
 
 def is_truth(channel: Channel) -> bool:
@@ -250,6 +261,8 @@ def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
         return None
     if log.complete:
         return f"damaged: {log.damage}"
+    if log.window is not None:
+        return f"damaged: what is lost may be of the window ({log.damage})"
     channels = [c for c in log.channels if c.topic == topic]
     number = sum(c.messages for c in channels)
     expected = sum(c.expected for c in channels if c.expected is not None)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,8 @@ from copem_replay.errors import RecordingError
 from copem_replay.experiment import Recorded
 from copem_replay.fusion.agree import AGREE
 from copem_replay.lists import RecordedLists, read_recorded
+from copem_replay.read import Recording
 from copem_replay.resample import at_instants
-from copem_replay.topics import Surroundings
 from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.unit_lists import read_listed
 from copem_replay.wording import counted
@@ -63,17 +62,17 @@ class RecordedUnits:
         )
 
 
-def recorded_unit(
-    path: Path, scene: Scene, name: str, asked: Recorded, around: Surroundings | None = None
-) -> tuple[RecordedLists, list[str]]:
-    """A unit's lists with all that is asked for, and what has to be said of them. `around`: the frames of the truth.
+def recorded_unit(recording: Recording, name: str, asked: Recorded) -> tuple[RecordedLists, list[str]]:
+    """A unit's lists with all that is asked for, in the window and frames of the truth, and what has to be said.
 
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
-    found = read_listed(path, asked.topic, scene, around) or read_recorded(path, asked.topic, scene)
+    path, scene, window = recording.path, recording.scene, recording.window
+    found = read_listed(path, asked.topic, scene, recording.around, window)
+    found = found or read_recorded(path, asked.topic, scene, window)
     tracks = found.tracks
     if not len(tracks.stamp_ns):
-        raise RecordingError(f"{path}: {asked.topic}: holds no list")
+        raise RecordingError(f"{path}: {asked.topic}: holds no list{' in the window' if window else ''}")
     unsaid = ~found.spread_said
     if unsaid.any() and asked.covariance_m2 is None:
         raise RecordingError(

@@ -6,7 +6,6 @@ all but the .rrd.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -21,8 +20,8 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.accuracy_tables import AccuracyTables
-from copem_replay.bag_metadata import files_of
 from copem_replay.check import place_of
+from copem_replay.digest import sha256_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
 from copem_replay.plain_yaml import dump
@@ -155,7 +154,14 @@ def _show(
         "run_is": shown.why,
     }
     said = write_mcap(
-        Path(f"{target}.mcap"), recording.path, one.replay.scene, one.beliefs, rows, manifest, family_of(recording)
+        Path(f"{target}.mcap"),
+        recording.path,
+        one.replay.scene,
+        one.beliefs,
+        rows,
+        manifest,
+        family_of(recording),
+        recording.window,
     )
     return said + write_rrd(
         Path(f"{target}.rrd"),
@@ -186,11 +192,12 @@ def provenance_of(
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
-            {"log": r.scene.log, "topic": r.topic, "sha256": _sha256(r.path)} for r in recordings
+            {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.path)} for r in recordings
         ],
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility,
         "max_gap_s": experiment.max_gap_s,
+        "window_s": experiment.window_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},
         "braking": experiment.braking and experiment.braking.model_dump(mode="json", by_alias=True),
         "run_shown": {log: runs[0].run for log, runs in shown.items()},
@@ -227,15 +234,6 @@ def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
 def write_csv(table: pd.DataFrame, path: Path) -> None:
     """A table as CSV: nulls empty, numbers with nine significant digits."""
     table.to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
-
-
-def _sha256(path: Path) -> str:
-    """Of a file; of a folder of rosbag2, of its files one after the other, as `cat` has them."""
-    digest = hashlib.sha256()
-    for place in files_of(path) if path.is_dir() else [path]:
-        with place.open("rb") as file:
-            hashlib.file_digest(file, lambda: digest)
-    return digest.hexdigest()
 
 
 def _umask() -> int:

@@ -91,6 +91,8 @@ def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroun
     frames, notes = Frames(), list(found.notes())
     of_channel: dict[int, Poses] = {}
     for channel in channels:
+        if not found.payloads[channel.number]:  # none in the window
+            continue
         try:
             poses = _bare(
                 poses_of(
@@ -103,6 +105,8 @@ def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroun
         of_channel[channel.number] = poses
         frames.add(poses, static=channel.topic.endswith("tf_static"))
     chosen = _ego_channel(log, channels, asked, seek_ego)
+    if chosen is not None and not found.payloads[chosen.number]:
+        raise RecordingError(f"{log.path}: ego: no pose on topic {chosen.topic!r}{_there(log)}")
     if chosen is None or chosen.number not in of_channel:
         return Surroundings(frames, None, asked, tuple(notes))
     poses = of_channel[chosen.number]
@@ -117,8 +121,12 @@ def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroun
     course = course_of(poses, picked)
     if course is None:
         of = f" of frame {child!r}" if child else ""
-        raise RecordingError(f"{log.path}: ego: no pose on topic {chosen.topic!r}{of}")
+        raise RecordingError(f"{log.path}: ego: no pose on topic {chosen.topic!r}{of}{_there(log)}")
     return Surroundings(frames, course, asked, (*notes, *_on_ego(chosen, asked)))
+
+
+def _there(log: Log) -> str:
+    return "" if log.window is None else " in the window"
 
 
 def _bare(poses: Poses) -> Poses:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 from array import array
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
@@ -56,14 +57,13 @@ class Trace(Log):
     times_ns: Sequence[int] = field(default=(), repr=False)
 
     def messages(self, numbers: Set[int]) -> Iterator[Message]:
-        """All messages in order of their time stamps, if the one channel is asked for."""
-        (channel,) = self.channels
-        if channel.number not in numbers:
-            return
+        """Messages in order of their time stamps, if the one channel is asked for."""
         with open_file(self.path) as file:
-            for offset, length, time_ns in zip(self.offsets, self.lengths, self.times_ns, strict=True):
-                file.seek(offset)
-                yield Message(channel.number, time_ns, file.read(length), time_ns, 0)
+            for number, (first_ns, last_ns) in self.spans(numbers).items():
+                for k in range(bisect_left(self.times_ns, first_ns), bisect_right(self.times_ns, last_ns)):
+                    file.seek(self.offsets[k])
+                    time_ns = self.times_ns[k]
+                    yield Message(number, time_ns, file.read(self.lengths[k]), time_ns, 0)
 
 
 def open_trace(path: Path) -> Trace:
@@ -105,6 +105,7 @@ def open_trace(path: Path) -> Trace:
         damage=cut[0] if cut else None,
         complete=not cut,
         start_ns=min(times_ns),
+        end_ns=max(times_ns),
         notes=tuple(notes),
         osi_version=release,
         offsets=np.array(offsets)[order].tolist(),

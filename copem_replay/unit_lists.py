@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from copem_replay import container
+from copem_replay.errors import RecordingError
 from copem_replay.formats import detail
 from copem_replay.formats.columns import LAST_NS
 from copem_replay.formats.fields import Listed
@@ -24,12 +25,15 @@ from copem_replay.formats.shred import take_apart
 from copem_replay.lists import RecordedLists, as_tracks
 from copem_replay.topics import Surroundings, gathered, in_world, known_lists, lists_of, surroundings
 from copem_replay.tracks import UNCERTAINTIES, VALUES, Bool, Float, Int, Scene
+from copem_replay.window import Window
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def read_listed(path: Path, topic: str, scene: Scene, around: Surroundings | None) -> RecordedLists | None:
+def read_listed(
+    path: Path, topic: str, scene: Scene, around: Surroundings | None, window: Window | None = None
+) -> RecordedLists | None:
     """The lists on `topic`, in the world of the truth; None: none of a known format is there. Raises RecordingError."""
-    log = container.open_log(path)
+    log = container.open_log(path).within(window)
     try:
         return _read(log, topic, scene, around)
     except container.BrokenIndexError as error:
@@ -41,6 +45,8 @@ def _read(log: container.Log, topic: str, scene: Scene, around: Surroundings | N
     if not channels:
         return None
     mine = [c for c in channels if c.schema == channels[0].schema]
+    if log.window is not None and next(log.payloads(frozenset(c.number for c in mine)), None) is None:
+        raise RecordingError(f"{log.path}: {topic}: holds no list in the window")
     around = around or surroundings(log, None, seek_ego=False)
     found = in_world(lists_of(log, mine, None), around, f"{log.path}: {topic}")
     return _recorded(found, _details(log, topic), topic, scene)

@@ -28,6 +28,7 @@ from copem_replay.fusion.belief import Belief
 from copem_replay.originals import Source, source_of
 from copem_replay.passthrough import Catalogue
 from copem_replay.tracks import SAME_INSTANT_NS, Scene, Tracks
+from copem_replay.window import Window
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
@@ -45,17 +46,19 @@ def write_mcap(
     table: pd.DataFrame,
     manifest: Mapping[str, str],
     family: Family | None = None,
+    window: Window | None = None,
 ) -> list[str]:
     """`source` with the fused lists of one run added, stretch by stretch: `belief[configuration]` has values (1, P).
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
+    `window`: of `source` that was read, None: all.
 
     Returns what has to be said of what could not be copied, or was replaced.
 
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
-    original = source_of(source)
+    original = source_of(source, window)
     family = family or Osi()
     rest = iter(beliefs)
     first = next(rest)  # it tells the configurations and the units

@@ -30,7 +30,8 @@ def _empty(node: Any) -> Any:
         return made(detail)
     if kind == 3:
         return np.zeros(detail[1])
-    return []
+    inner, what = detail[0]
+    return np.zeros(0, dtype=np.uint8) if inner == 1 and what[0] != "string" else []
 
 
 def header(t_s: float, frame: str) -> Any:

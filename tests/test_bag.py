@@ -340,6 +340,19 @@ def messages(path: Path) -> list[tuple[str, str, int, bytes]]:
         return sorted((c.topic, s.name if s else "", m.log_time, m.data) for s, c, m in found)
 
 
+def test_results_of_a_folder_are_drawn_from_it_again(bag, monkeypatch, capsys):
+    """As long as its files, one after the other, are what was replayed."""
+    monkeypatch.chdir(bag.parent)
+    Path("bag.yaml").write_text(changed("logs: [drive.2026]"))
+    assert run("run", "bag.yaml", monkeypatch=monkeypatch) == 0
+    capsys.readouterr()
+    assert run("plot", "out/bag", monkeypatch=monkeypatch) == 0
+    assert capsys.readouterr().err == ""
+    write_recording(bag / "bag_2.mcap", FRAMES[20:29], host=1)
+    assert run("plot", "out/bag", monkeypatch=monkeypatch) == 0
+    assert "drive.2026: expected the log that was replayed, SHA-256" in capsys.readouterr().err
+
+
 def test_records_of_the_files_are_kept_once(bag, monkeypatch):
     for k in range(3):
         with (bag / f"bag_{k}.mcap").open("wb") as file:

@@ -296,7 +296,7 @@ SWEEP = "sweep: %s", "19: sweep"
 
 KEYS = (
     "braking, configurations, ego, logs, max_gap_s, measure, obstacles, pems, read, runs, seed, show, sweep, units, "
-    "version, visibility"
+    "version, visibility, window_s"
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"
 FUSIONS = "ideal, union, nms, gnn, tracker"
@@ -320,6 +320,13 @@ CASES = [
     (TOP, "runs:", "3: runs: expected a whole number, found nothing"),
     (TOP, "seed: 1_000", "4: seed: expected a whole number, found '1_000'"),
     (TOP, "read: {topic: 5}", "19: read.topic: expected text, found 5"),
+    (TOP, "window_s: [2, 1]", "19: window_s: expected [from, to], found one that ends (1 s) before it begins (2 s)"),
+    (TOP, "window_s: [-1, 1]", "19: window_s[0]: expected at least 0, found -1"),
+    (TOP, "window_s: [0, .inf]", "19: window_s[1]: expected a finite number, found inf"),
+    (TOP, "window_s: [0, '9']", "19: window_s[1]: expected a number, found '9'"),
+    (TOP, "window_s: [0]", "19: window_s[1]: missing"),
+    (TOP, "window_s: [0, 1, 2]", "19: window_s: expected at most 2 in the list, found [0, 1, 2]"),
+    (TOP, "window_s: 5", "19: window_s: expected a list, found 5"),
     (TOP, "max_gap_s: 0", "19: max_gap_s: expected more than 0, found 0"),
     (TOP, "max_gap_s: .inf", "19: max_gap_s: expected a finite number, found inf"),
     (TOP, "max_gap_s: .nan", "19: max_gap_s: expected a finite number, found nan"),

@@ -22,7 +22,7 @@ def check_comparable(folders: Sequence[Folder]) -> None:
 
 def _problems(first: Folder, other: Folder) -> Iterator[str]:
     yield from _logs(first, other)
-    for key in ("seed", "max_gap_s"):
+    for key in ("seed", "window_s", "max_gap_s"):
         yield from _differs(first, other, key, getattr(first, key), getattr(other, key))
     # As written: whom `null` stands for is in the logs.
     yield from _differs(first, other, "ego", first.ego, other.ego)

@@ -67,6 +67,7 @@ class Folder:
     logs: tuple[LogFile, ...]
     visibility: str | None
     max_gap_s: float | None
+    window_s: object
     measure: dict[str, Any]
     braking: dict[str, Any] | None
     ego: object
@@ -121,6 +122,7 @@ def _provenance(path: Path) -> dict[str, Any]:
             "logs": logs,
             "visibility": data.get("visibility"),
             "max_gap_s": None if gap_s is None else float(gap_s),
+            "window_s": data.get("window_s"),
             # A key that an older version did not have stood for its default.
             "measure": Measure().model_dump(mode="json", by_alias=True) | measure,
             "braking": None if braking is None else dict(braking),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 
 from copem_replay.check import read_logs
+from copem_replay.digest import sha256_of
 from copem_replay.errors import RecordingError
 from copem_replay.experiment import Experiment
 from copem_replay.measure_keys import Objects
@@ -34,8 +34,7 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
     """
     file = next(file for file in results.logs if file.name == log)
     try:
-        with file.path.open("rb") as content:
-            found = hashlib.file_digest(content, "sha256").hexdigest()
+        found = sha256_of(file.path)
     except OSError as error:
         raise RecordingError(
             f"{file.path}: cannot be read: {error.strerror}; put the log back to draw its runs"

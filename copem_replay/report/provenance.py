@@ -21,7 +21,8 @@ def provenance(study: Study) -> Html:
     notes = [str(note) for note in data.get("notes", [])]
     if study.regret is not None:
         notes += [note.removeprefix(f"{study.results.folder}: ") for note in study.regret.notes]
-    made = {key: data.get(key) for key in ("copem_replay", "python", "seed", "runs", "visibility", "max_gap_s")}
+    keys = ("copem_replay", "python", "seed", "runs", "window_s", "visibility", "max_gap_s")
+    made = {key: data.get(key) for key in keys}
     measured = {key: data.get(key) for key in ("measure", "braking", "run_shown")}
     return joined(
         [

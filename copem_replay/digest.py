@@ -1,0 +1,20 @@
+"""What tells whether a recording is still the one that was replayed."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from copem_replay.bag_metadata import files_of
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file; of a folder of rosbag2, of its files one after the other, as `cat` has them.
+
+    Raises OSError, and RecordingError where the folder is none of rosbag2.
+    """
+    digest = hashlib.sha256()
+    for place in files_of(path) if path.is_dir() else [path]:
+        with place.open("rb") as file:
+            hashlib.file_digest(file, lambda: digest)
+    return digest.hexdigest()
