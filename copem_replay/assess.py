@@ -1,4 +1,4 @@
-"""Assess: the statistics of `accuracy.py`, added up stretch of lists after stretch, or of all lists at once."""
+"""Assess: the statistics of `accuracy.py`, added up stretch of lists after stretch."""
 
 from __future__ import annotations
 
@@ -88,28 +88,6 @@ class Assessment:
             raise ValueError(f"Assessment: expected {len(self._issue_s)} lists, found {self._added}")
         close(self._stays, self._so_far, self._out)
         return Accuracy(self._settings, self._stays.first_list, self._stays.lists, *self._out)
-
-
-def assess(
-    lists: Lists,
-    matches: Matches,
-    issue_s: Float,
-    world: Tracks,
-    truth_at_capture: Tracks,
-    scene: Scene,
-    looks: Looks,
-    stay_from_s: Float,
-    reference: Reference,
-    measured_class: Bool,
-    *,
-    settings: Settings,
-) -> Accuracy:
-    """Add up how far off all lists are at once: what `Assessment` is given, with the truth at all captures."""
-    whole = Assessment(
-        issue_s, scene, looks, stay_from_s, reference, measured_class, settings=settings, runs=len(lists.start)
-    )
-    whole.add(lists, matches, world, truth_at_capture)
-    return whole.result()
 
 
 def _column(values: tuple[float, ...]) -> Float:

@@ -126,22 +126,6 @@ class FirstMatches:
         return detections, Steps(*map(np.ascontiguousarray, columns))
 
 
-def first_matches(
-    lists: Lists,
-    matches: Matches,
-    issue_s: Float,
-    looks: Looks,
-    *,
-    confirm: Confirm,
-    count_earlier: bool,
-    captures: Captures,
-) -> tuple[Detections, Steps]:
-    """The same of all lists at once."""
-    whole = FirstMatches(looks, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, captures=captures)
-    whole.add(lists, matches, issue_s)
-    return whole.result()
-
-
 def _sources(entries: Entries, captures: Captures) -> Int:
     """(N, 2) the capture instant and the list each entry goes back to, −1: none.
 

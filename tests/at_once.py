@@ -1,0 +1,51 @@
+"""All lists at once, through what takes them stretch by stretch."""
+
+from __future__ import annotations
+
+from copem_replay.accuracy import Accuracy, Settings
+from copem_replay.assess import Assessment
+from copem_replay.detect import Detections
+from copem_replay.fusion.object_list import Lists
+from copem_replay.match import Matches
+from copem_replay.matched import Captures, FirstMatches, Steps
+from copem_replay.measure_keys import Confirm
+from copem_replay.onset import Looks, Reference
+from copem_replay.tracks import Bool, Float, Scene, Tracks
+
+
+def assess(
+    lists: Lists,
+    matches: Matches,
+    issue_s: Float,
+    world: Tracks,
+    truth_at_capture: Tracks,
+    scene: Scene,
+    looks: Looks,
+    stay_from_s: Float,
+    reference: Reference,
+    measured_class: Bool,
+    *,
+    settings: Settings,
+) -> Accuracy:
+    """Add up how far off all lists are at once: what `Assessment` is given, with the truth at all captures."""
+    whole = Assessment(
+        issue_s, scene, looks, stay_from_s, reference, measured_class, settings=settings, runs=len(lists.start)
+    )
+    whole.add(lists, matches, world, truth_at_capture)
+    return whole.result()
+
+
+def first_matches(
+    lists: Lists,
+    matches: Matches,
+    issue_s: Float,
+    looks: Looks,
+    *,
+    confirm: Confirm,
+    count_earlier: bool,
+    captures: Captures,
+) -> tuple[Detections, Steps]:
+    """The same of all lists at once."""
+    whole = FirstMatches(looks, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, captures=captures)
+    whole.add(lists, matches, issue_s)
+    return whole.result()
