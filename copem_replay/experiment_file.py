@@ -136,12 +136,18 @@ _EXPECTED = {
 }
 
 
+def _unit(written: str, meant: str) -> str:
+    """That a key has another unit than the one it was taken for, where names say so."""
+    (name, _, unit), (other, _, right) = written.rpartition("_"), meant.rpartition("_")
+    return f" (in {right}, not {unit})" if name == other and name else ""
+
+
 def _message(items: Sequence[Any], key: Key, data: Any) -> str:
     first = items[0]
     if first["type"] == "extra_forbidden":
         known = _names_at(key[:-1], data)
         near = difflib.get_close_matches(str(key[-1]), known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+        hint = f"did you mean {near[0]}?{_unit(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
         return "unknown key" + (f"; {hint}" if known else "")
     if first["type"] == "missing":
         return "missing"

@@ -159,9 +159,11 @@ def _notes(replay: Replay, experiment: Experiment) -> list[str]:
             notes.append(f"unit {name}: no object ever meets a condition of its PEM {unit.pem!r}")
     scene, measure = replay.scene, experiment.measure
     if not len(measured_objects(scene, measure)):
-        there = sorted({CLASSES[k] for k in scene.object_class})
+        others = np.arange(len(scene.object_class)) != scene.ego_ix
+        there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["nobody"]
         wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
-        notes.append(f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}")
+        beside = " beside the ego" if scene.ego_ix >= 0 else ""
+        notes.append(f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}")
     elif isinstance(measure.onset, At) and measure.onset.time_s > scene.end_s:
         notes.append(f"no rows: the onset at {measure.onset.time_s:g} s lies after the log's end, {scene.end_s:g} s")
     elif not len(replay.looks.object_ix):

@@ -73,7 +73,7 @@ def cut_out(log: Log, topic: str, window_s: WindowSeconds) -> Log:
     if next(cut.payloads(numbers), None) is None:
         span_s = (_last_ns(log, numbers) - first_ns) * 1e-9
         raise EmptyWindowError(
-            f"{log.path}: {topic}: no message in the window {_in_words(from_s, to_s)}; there are some from 0 to "
+            f"{log.path}: {topic}: no message in the window {in_words(from_s, to_s)}; there are some from 0 to "
             f"{span_s:.10g} s"
         )
     return cut
@@ -91,10 +91,10 @@ def window_notes(window_s: WindowSeconds) -> list[str]:
     """Say that only a window was read."""
     if window_s is None or window_s == (None, None):
         return []
-    return [f"window {_in_words(*window_s)} of the recording: seconds count from there"]
+    return [f"window {in_words(*window_s)} of the recording: seconds count from there"]
 
 
-def _in_words(from_s: float | None, to_s: float | None) -> str:
+def in_words(from_s: float | None, to_s: float | None) -> str:
     """`10 – 20 s`, `from 10 s on`, `up to 20 s`."""
     if from_s is not None and to_s is not None:
         return f"{from_s:.10g} – {to_s:.10g} s"

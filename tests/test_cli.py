@@ -385,6 +385,10 @@ class TestRun:
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
         assert ended.out.splitlines()[1].split() == ["GT", "0", "10", "–", "–", "–", "–", "–", "–", "–"]
+        refused = call("compare", "out/e", "--baseline", "PEM")
+        assert (refused.code, refused.lines) == (
+            2, ["out/e: nobody was measured, so nothing can be compared: no measured object has an onset"],
+        )  # fmt: skip
 
     @pytest.mark.parametrize(
         ("change", "said"),

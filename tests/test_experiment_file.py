@@ -451,6 +451,7 @@ CASES = [
      ".latency_s.ego: expected at least 0, found -1",
      ".latency_s.mast: expected a number, found 'x'"),
     (COPEM, "latncy_s: 1", ".latncy_s: unknown key; did you mean latency_s?"),
+    (COPEM, "latency_ms: 500", ".latency_ms: unknown key; did you mean latency_s? (in s, not ms)"),
     (COPEM, "fusion: ideal", f".fusion: expected {{kind: …}}, kind one of {FUSIONS}; found 'ideal'"),
     (COPEM, "fusion: {kind: real}", f".fusion: kind: expected one of {FUSIONS}, or package.module:Class; found 'real'"),
     (COPEM, "fusion: {combine: mean}", ".fusion.combine: expected 'samples' or 'posterior', found 'mean'"),

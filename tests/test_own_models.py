@@ -9,6 +9,7 @@ import pytest
 
 import scenes
 from copem_replay.errors import InputError
+from copem_replay.fusion.component import Inbox, StepFusion
 from copem_replay.pem.detection import DetectionModel
 from copem_replay.pem.error import ErrorModel
 from copem_replay.pem.look import Errors, Look, Noise
@@ -97,3 +98,20 @@ class Forgotten(DetectionModel):
 def test_a_model_without_its_method_is_refused() -> None:
     with pytest.raises(ValueError, match=r"test_own_models:Forgotten' lacks probability"):
         plan({"kind": "test_own_models:Forgotten"})
+
+
+class Number(StepFusion):
+    """Gives no list."""
+
+    kind: str = "test_own_models:Number"
+
+    def step(self, now_s: float, inbox: Inbox, memory: Any) -> Any:
+        return 3
+
+
+def test_a_step_that_gives_something_else_is_named() -> None:
+    own = {"GT": {"units": "truth"}, "own": {"units": ["ego"], "fusion": {"kind": "test_own_models:Number"}}}
+    wrong = scenes.experiment(configurations=own)
+    said = r"^configurations\.own\.fusion: test_own_models:Number: .*step: expected a list and a memory, found int"
+    with pytest.raises(InputError, match=said):
+        believed(prepare(scenes.oncoming_car(), wrong), wrong, 0)

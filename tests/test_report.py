@@ -188,14 +188,22 @@ class TestWords:
         )
         assert not any("excluding 0" in line for line in lines)
 
-    def test_an_interval_that_includes_0_is_no_difference(self, tmp_path: Path) -> None:
+    def test_who_is_alike_is_no_winner(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
         lines = lines_of(replayed(tmp_path, text))
-        assert lines[2].endswith(", but cannot be told from hit.")
-        assert lines[3] == (
-            "No difference to it can be shown, the interval including 0: hit (±0 s [0, 0]). That is not to say that "
-            "there is none."
+        assert lines[2].startswith("half and hit knew at the very same times: after ")
+        assert not any("No difference" in line or "cannot be told" in line for line in lines)
+
+    def test_an_interval_that_includes_0_is_no_difference(self, tmp_path: Path) -> None:
+        """Another unit that lists him every other time, by draws of its own."""
+        other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
+        hit = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}")
+        lines = lines_of(replayed(tmp_path, changed(ONE, other, hit, *ALONE[:2], ALONE[3])))
+        assert re.search(r", but cannot be told from (hit|half)\.$", lines[2])
+        assert re.match(
+            r"No difference to it can be shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3]
         )
+        assert lines[3].endswith("]). That is not to say that there is none.")
 
     def test_one_configuration_is_compared_with_nothing(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(ONE, *ALONE))

@@ -254,6 +254,27 @@ def test_pieces_are_whole_lists_and_together_all(monkeypatch: pytest.MonkeyPatch
     assert np.concatenate([times for _, _, times in pieces]).tolist() == [k * 100_000_000 for k in range(11)]
 
 
+def test_an_entry_that_no_object_is_matched_with(tmp_path: Path) -> None:
+    """The ego lists the pedestrian 10 m east of where he is: the ideal fusion knows whom it is about, gnn does not.
+
+    Its lists are 0.3 s late; while none has arrived, one is under way.
+    """
+    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("2", "pedestrian", standing(20, 0))], until_s=1.0)
+    wrong = {"kind": "gaussian", "covariance_m2": [[0.01, 0.0], [0.0, 0.01]], "mean_m": [10.0, 0.0]}
+    made = make(
+        tmp_path / "replay.rrd", scene, measure=PERSON,
+        pems={"sure": [{"detection": {"kind": "constant", "probability": 1.0}, "error": wrong}]},
+        configurations={
+            name: {"units": ["ego"], "latency_s": 0.3, "fusion": {"kind": name}} for name in ("ideal", "gnn")
+        },
+    )  # fmt: skip
+    for now_s in (0.35, 0.55, 0.95):
+        assert told(made.path, "gnn", now_s) == ["2 listed by ego, no entry matched"]
+        assert told(made.path, "ideal", now_s) == ["2 known, 0.3 s old"]
+    assert told(made.path, "gnn", 0.05) == ["2 listed by ego, arrives in 0.3 s"]
+    assert lane(made.path, "2 pedestrian", 1) == [(0.0, "gnn captured"), (0.3, "gnn unmatched")]
+
+
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 

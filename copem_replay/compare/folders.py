@@ -101,12 +101,24 @@ def read_folder(path: Path) -> Folder:
             raise InputError(f"{path}: expected a results folder, found no {name} in it; `copem-replay run` writes one")
     fields = _provenance(path / "provenance.json")
     columns = _DETECTIONS | (_BRAKING if fields["braking"] is not None else {})
+    if _rowless(path / "detections.parquet"):
+        raise InputError(f"{path}: nobody was measured, so nothing can be compared: no measured object has an onset")
     tables = {"detections.parquet": _table(path / "detections.parquet", columns)}
     tables |= {name: _table(path / name, of) for name, of in OPTIONAL.items() if (path / name).is_file()}
     experiment = _experiment(path / "experiment.yaml")
     always = bool(fields["measure"]["match"].get("always"))
     by_id = frozenset() if always else frozenset(_by_truth_id(experiment.get("configurations")))
     return Folder(path=path, ego=experiment.get("ego"), by_truth_id=by_id, tables=tables, **fields)
+
+
+def _rowless(path: Path) -> bool:
+    """Whether a table is sound and has no row: then its columns have no types either."""
+    from pyarrow import parquet
+
+    try:
+        return bool(parquet.read_metadata(path).num_rows == 0)
+    except (OSError, ValueError):  # it is said by who reads it
+        return False
 
 
 def _provenance(path: Path) -> dict[str, Any]:

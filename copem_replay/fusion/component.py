@@ -114,7 +114,10 @@ class StepFusion(ListFusion):
         for s in range(runs):
             start[s, 0] = total
             for k in range(instants):
-                entries, memories[s] = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memories[s])
+                given = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memories[s])
+                if not isinstance(given, tuple) or len(given) != 2:
+                    raise TypeError(f"step: expected a list and a memory, found {type(given).__name__}")
+                entries, memories[s] = given
                 if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY or entries.ndim != 1:
                     found = entries.dtype.name if isinstance(entries, np.ndarray) else type(entries).__name__
                     raise TypeError(f"step: expected a list (an array of ENTRY) and a memory, found {found}")

@@ -61,6 +61,13 @@ def _soonest(study: Study) -> Html:
         return joined([name, f" knew after {cell(mean_s)} s on the average ({counted_as}). There is nothing to compare "
                        f"it with: {alone}."])  # fmt: skip
     later, alike, sooner, _ = _told_apart(study.lead)
+    same = _equal(alike)
+    if len(same):
+        names = " and ".join([some([study.best, *same["configuration"]][:-1]), str(same["configuration"].iloc[-1])])
+        rest = len(study.lead.configurations) - len(same)
+        whom = f" The other {rest} are below." if rest > 1 else " The other is below." if rest else ""
+        return joined([tag("b", names), f" knew at the very same times: after {cell(mean_s)} s on the average "
+                       f"({counted_as}).{whom}"])  # fmt: skip
     undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
     whom = f"the other {others}" if others > 1 else study.lead.configurations[0]
     has, sure = f" has the shortest mean time, {cell(mean_s)} s", "; how sure that is, no interval tells"
@@ -81,6 +88,11 @@ def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFr
     return rows[later], rows[~unsure & ~later & ~sooner], rows[sooner], rows[unsure]
 
 
+def _equal(alike: pd.DataFrame) -> pd.DataFrame:
+    """Of those that cannot be told from the best the ones that do not differ at all."""
+    return alike[(alike[["difference", "low", "high"]].abs() <= NOTHING).all(axis=1)]
+
+
 def _others(study: Study) -> Iterator[str]:
     """The others by whether their difference to the best can be told from none."""
     if study.lead is None:
@@ -88,6 +100,7 @@ def _others(study: Study) -> Iterator[str]:
     later, alike, sooner, unsure = _told_apart(study.lead)
     if len(later):
         yield f"Later than that, the interval of the difference excluding 0: {_each(later)}."
+    alike = alike.drop(_equal(alike).index)
     if len(alike):
         yield (
             f"No difference to it can be shown, the interval including 0: {_each(alike)}. That is not to say that "
@@ -186,11 +199,13 @@ def _accuracy(study: Study) -> Iterator[str]:
     if "gospa_m" not in rows:
         return
     known = rows.loc[list(study.contenders), "gospa_m"].dropna().astype(float)
+    own = rows.loc[known.index, "list_rate_hz"].round(2).nunique() > 1
+    more = "; each over its own lists, of which some have more than others" if own else ""
     if len(known) > 1 and known.min() < known.max():
         best, worst = str(known.idxmin()), str(known.idxmax())
         yield (
             f"The best lists, places, misses and false entries taken together, had {best}: GOSPA "
-            f"{cell(known[best])} m, against {cell(known[worst])} m with {worst}."
+            f"{cell(known[best])} m, against {cell(known[worst])} m with {worst}{more}."
         )
 
 

@@ -9,6 +9,7 @@ from copem_replay.measure_keys import Appears, At, InRange, LineOfSight, StartsM
 from copem_replay.report.markup import Html, table, tag
 from copem_replay.report.study import Study
 from copem_replay.report.tables import named
+from copem_replay.window import in_words
 from copem_replay.wording import counted
 
 _CLASSES = {"vru": "vulnerable road user", "vehicles": "vehicle"}
@@ -25,7 +26,11 @@ def some(names: Sequence[str]) -> str:
 def logs(study: Study) -> str:
     """Which recordings."""
     names = [file.name for file in study.results.logs]
-    return f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({some(names)})"
+    window = study.results.experiment.window_s
+    part = ""
+    if window is not None and window != (None, None):
+        part = f" ({in_words(*window)} of {'it' if len(names) == 1 else 'each'})"
+    return (f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({some(names)})") + part
 
 
 def question(study: Study) -> str:

@@ -23,6 +23,7 @@ from copem_replay.show.status import (
     OUT,
     STATUSES,
     UNLISTED,
+    UNMATCHED,
     VISIBLE,
     Status,
 )
@@ -44,6 +45,7 @@ LANES: Mapping[int, Rgb] = {
     HIDDEN: (130, 45, 40),
     VISIBLE: (115, 115, 115),
     LOST: (120, 50, 90),
+    UNMATCHED: (120, 90, 30),
 }
 """Of statuses in which nobody knows; captured has the configuration's colour darkened, known its own."""
 
@@ -87,6 +89,8 @@ def _sentence(ids: tuple[str, ...], who: str, unit: str, key: list[int]) -> str:
         return f"{who} known" if tenths * 0.1 <= OLD_S else f"{who} known, {tenths / 10:.1f} s old"
     if status == CAPTURED:
         return f"{who} listed by {unit}, arrives in {tenths / 10:.1f} s"
+    if status == UNMATCHED:
+        return f"{who} listed by {unit}, no entry matched"
     if status == LOST:
         return f"{who} listed by {unit}, list lost"
     if status == VISIBLE:

@@ -11,6 +11,7 @@ At an instant, of an object and the units of a configuration, the last of these 
 | visible | one does, but no list under way holds it |
 | lost | a unit's newest list held it, and will never arrive |
 | captured | a list that holds it is under way |
+| unmatched | a unit's newest list that has arrived holds it; of the fused list no entry is matched with it |
 | known | the receiver's newest list holds it |
 """
 
@@ -28,8 +29,8 @@ from copem_replay.show.out import elapsed_ns, ns
 from copem_replay.show.sight import CLEAR_ABOVE, Sight
 from copem_replay.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Tracks
 
-STATUSES = ("absent", "not listed", "out of view", "hidden", "visible", "lost", "captured", "known")
-ABSENT, UNLISTED, OUT, HIDDEN, VISIBLE, LOST, CAPTURED, KNOWN = range(len(STATUSES))
+STATUSES = ("absent", "not listed", "out of view", "hidden", "visible", "lost", "captured", "unmatched", "known")
+ABSENT, UNLISTED, OUT, HIDDEN, VISIBLE, LOST, CAPTURED, UNMATCHED, KNOWN = range(len(STATUSES))
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,15 @@ def _under_way(captured_ns: Int, arrives_ns: Float, stamps_ns: Int, unit: int, m
     arrived = np.searchsorted(arrivals, now, side="right")
     left_s = (np.append(arrivals, np.inf)[arrived] - made.elapsed_ns) * 1e-9
     soonest = (sent > arrived) & ~(made.until_s[:, m] <= left_s)
+    soonest &= made.status[:, m] < UNMATCHED
     made.status[soonest, m], made.unit_ix[soonest, m], made.until_s[soonest, m] = CAPTURED, unit, left_s[soonest]
+    if travels.any():
+        # Gone by until a list that was captured later has been as long on its way.
+        newest = np.maximum(arrived - 1, 0)
+        held_ns, took_ns = captured_ns[travels][newest], (arrives_ns - captured_ns)[travels][newest]
+        newer = np.searchsorted(stamps_ns, now - took_ns, "right") > np.searchsorted(stamps_ns, held_ns, "right")
+        heard = (arrived > 0) & ~newer & (made.status[:, m] != ABSENT)
+        made.status[heard, m], made.unit_ix[heard, m] = UNMATCHED, unit
 
 
 def _known(belief: Belief, object_ix: int, m: int, made: Status) -> None:
