@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay import repair
-from copem_replay.formats.columns import Columns
+from copem_replay.formats.columns import FARTHEST_M, Columns
 from copem_replay.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.wording import counted
 
-FARTHEST_M = 1e7  # a coordinate beyond is no position (chosen; UTM northings end at 1e7)
 LONGEST_M = 1000.0  # no wall, train or building is longer, wider or higher (chosen)
 _X, _Y, _Z, _YAW, _VX, _VY, _LENGTH, _WIDTH, _HEIGHT = range(len(VALUES))
 

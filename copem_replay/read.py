@@ -19,7 +19,7 @@ from copem_replay.container import Channel, Log
 from copem_replay.errors import RecordingError
 from copem_replay.formats import osi
 from copem_replay.formats.columns import Columns
-from copem_replay.tracks import CLASSES, Scene, Tracks
+from copem_replay.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.window import Window, WindowSeconds, cut_out, window_notes
 from copem_replay.wording import counted, printable
 
@@ -52,6 +52,7 @@ class Recording:
     encoding: str = "protobuf"  # of the messages of the truth
     world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
     window: Window | None = None  # of log time, that was read; None: all
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
 
 
 def read(
@@ -118,6 +119,7 @@ def read_log(
     return Recording(
         scene, truth, log.path, topic, said_all, host, damage,
         around=around, encoding=encoding, world=world, window=log.window,
+        lane_boundaries=columns.lane_boundaries,
     )  # fmt: skip
 
 

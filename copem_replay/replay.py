@@ -57,6 +57,7 @@ class Replay:
     recorded: RecordedUnits | None
     looks: Looks
     encounters: tuple[Encounter, ...]  # those in conflict
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
 
     @cached_property
     def ego(self) -> EgoCourse:
@@ -185,7 +186,7 @@ def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experime
     on = looks(scene, truth, placed.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)
     cut = stretches(scene, truth, fleet.experiment)
-    return Replay(scene, fleet, truth, placed, cut, recorded, on, meeting)
+    return Replay(scene, fleet, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries)
 
 
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:

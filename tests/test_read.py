@@ -721,3 +721,24 @@ def test_the_same_drive_as_ros_2_and_as_osi():
         for r in (ros, osi)
     ]
     np.testing.assert_allclose(*speeds, atol=1e-3)
+
+
+def test_boundaries_of_lanes(tmp_path: Path) -> None:
+    """Of the first message that has some; lines of fewer than two points, and points that are nowhere, are none."""
+    messages = []
+    for k in range(3):
+        truth = GroundTruth()
+        truth.timestamp.nanos = k * 10**8
+        one = truth.moving_object.add(type=2)
+        one.id.value, one.base.position.x, one.base.dimension.length = 1, 1.0 * k, 4.0
+        one.base.dimension.width, one.base.dimension.height = 2.0, 1.5
+        places = {1: [[(0, 2, 0), (50, 2, 0), (90, 3, 0.5)], [(0, -2, 0)], [(0, 9, 0), (math.nan, 9, 0), (5, 9, 0)]]}
+        for line in places.get(k, [[(7, 7, 0), (8, 8, 0)]] if k == 2 else []):
+            boundary = truth.lane_boundary.add()
+            for x, y, z in line:
+                point = boundary.boundary_line.add().position
+                point.x, point.y, point.z = x, y, z
+        messages.append((k * 10**8, truth.SerializeToString()))
+    write_mcap(tmp_path / "a.mcap", [Topic("truth", "osi3.GroundTruth", messages)])
+    lines = read(tmp_path / "a.mcap", name="a").lane_boundaries
+    assert [line.tolist() for line in lines] == [[[0, 2, 0], [50, 2, 0], [90, 3, 0.5]], [[0, 9, 0], [5, 9, 0]]]

@@ -510,3 +510,13 @@ def test_a_disk_that_is_full_is_an_error_and_leaves_nothing(made: Made, tmp_path
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_lanes_are_drawn_where_the_log_has_them(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    lines = (np.array([[0.0, 2, 0], [50, 2, 0]]), np.array([[0.0, -2, 0], [50, -2, 0], [60, -3, 0]]))
+    made = make(tmp_path / "with.rrd", replace(approaching(), lane_boundaries=lines))
+    drawn = static(made.path, "/world/truth/lanes")["LineStrips3D:strips"]
+    assert drawn == [line.tolist() for line in lines]
+    assert not list(chunks(make(tmp_path / "without.rrd", approaching()).path, "/world/truth/lanes"))

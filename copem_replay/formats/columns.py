@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from copem_replay.tracks import Bool, Float, Int
 
+FARTHEST_M = 1e7
+"""A coordinate beyond is no position (chosen; UTM northings end at 1e7)."""
 LAST_NS = 4_000_000_000 * 10**9
 """A later time is none (chosen: Unix time of 2096; differences of such times still fit 64 bits)."""
 
@@ -32,5 +34,6 @@ class Columns:
     object_ix: Int  # (P,) index into object_ids
     class_ix: NDArray[np.int8]  # (P,) index into CLASSES
     values: Float  # (P, len(VALUES))
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, in the truth's frame of reference: for showing only
     hosts: tuple[str, ...] = ()  # the host vehicle's id, once per message that says one
     notes: tuple[str, ...] = ()  # a line per kind of thing that was skipped or filled in

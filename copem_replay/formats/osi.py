@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from copem_replay.formats.columns import Columns
-from copem_replay.tracks import CLASSES, VALUES
+from copem_replay.formats.columns import FARTHEST_M, Columns
+from copem_replay.tracks import CLASSES, VALUES, Float
 from copem_replay.wording import counted
 
 GROUND_TRUTH = "osi3.GroundTruth"
@@ -85,6 +85,7 @@ class Decoder:
         self._object_ix = array("q")
         self._class_ix = array("b")
         self._values = array("d")
+        self._lane_boundaries: list[Float] = []
         self._notes: Counter[tuple[str, str]] = Counter()  # what is counted, and what is the matter with it
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int) -> None:
@@ -111,6 +112,8 @@ class Decoder:
         self._stamp_ns.append(seconds * 1_000_000_000 + nanos)
         self._stamped.append(stamped is not None)
         self._add_host(message, truth)
+        if not self._lane_boundaries and len(truth.lane_boundary):  # said once, or again in every message
+            self._add_lanes(truth.lane_boundary)
         before = len(self._object_ix)
         self._add_moving(truth.moving_object)
         self._add_stationary(truth.stationary_object)
@@ -128,6 +131,7 @@ class Decoder:
             object_ix=np.array(self._object_ix, dtype=np.int64),
             class_ix=np.array(self._class_ix, dtype=np.int8),
             values=np.array(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
+            lane_boundaries=tuple(self._lane_boundaries),
             hosts=tuple(self._hosts),
             notes=tuple(f"{counted(number, noun)} {what}" for (noun, what), number in self._notes.items()),
         )
@@ -188,6 +192,15 @@ class Decoder:
             self._object_ix.append(self._next_number(number_of, ident) if number is None else number)
             self._class_ix.append(OTHER)
             self._values.extend((x, y, position.z, yaw, 0.0, 0.0, size.length, size.width, size.height))
+
+    def _add_lanes(self, boundaries: Any) -> None:
+        """Lines of two points and more, of points that are somewhere."""
+        for boundary in boundaries:
+            points = [(p.position.x, p.position.y, p.position.z) for p in boundary.boundary_line]
+            line = np.array(points, dtype=np.float64).reshape(-1, 3)
+            line = line[(np.abs(line) <= FARTHEST_M).all(axis=1)]  # no NaN, either
+            if len(line) > 1:
+                self._lane_boundaries.append(line)
 
     def _next_number(self, number_of: dict[int, int], ident: int) -> int:
         """Give a number to an object not seen before; moving and stationary ones are numbered together."""

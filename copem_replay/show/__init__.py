@@ -3,6 +3,7 @@
 | entity | is |
 |---|---|
 | `world/truth/boxes`, `paths`, `onsets` | the log; of whom we look at, ways, and places at their onsets |
+| `world/truth/lanes` | boundaries of lanes, where the log has them |
 | `world/static`, `world/units/<unit>`, `world/fields/<unit>` | obstacles, units, and the fields of view of their PEMs |
 | `world/<configuration>/boxes`, `covariance` | what the receiver believes, paler the older; 2σ of where |
 | `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; who listed it |

@@ -106,6 +106,7 @@ def _world(
     words.legend(out)
     words.onsets(out, scene, table)
     world.statics(out, replay.placed.static)
+    world.lane_boundaries(out, replay.lane_boundaries)
     units.units(out, replay, experiment)
     marks.onsets(out, replay, experiment, table, shown)
     world.truth(out, scene, replay.truth, shown)

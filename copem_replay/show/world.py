@@ -10,7 +10,7 @@ import numpy as np
 from copem_replay.colours import Rgb
 from copem_replay.fusion.belief import Belief
 from copem_replay.show.out import Out, f32, object_labels, slices, upright
-from copem_replay.tracks import CLASS_GROUPS, CLASSES, Int, Scene, Tracks
+from copem_replay.tracks import CLASS_GROUPS, CLASSES, Float, Int, Scene, Tracks
 from copem_replay.visibility import Statics
 
 if TYPE_CHECKING:  # a second to import: only where something is written
@@ -27,6 +27,8 @@ ALPHAS, STEP_S = (220, 160, 120, 90, 65, 45), 0.2
 MOST_NAMES = 65_535
 """So many kinds of boxes the viewer can tell apart; objects past them share the last one's name."""
 
+LANE: Rgb = (95, 95, 105)
+"""Boundaries of lanes: seen, but behind all else."""
 _VRU, _VEHICLE, _OTHER = (235, 120, 140), (180, 180, 190), (150, 150, 130)
 
 
@@ -102,6 +104,15 @@ def statics(out: Out, static: Statics) -> None:
         albedo_factor=(110, 110, 110, 100),
     )
     out.static(["world", "static"], mesh)
+
+
+def lane_boundaries(out: Out, lines: Sequence[Float]) -> None:
+    """The lanes, where the log has them."""
+    import rerun as rr
+
+    if len(lines):
+        strips = [f32(*line.T) for line in lines]
+        out.static(["world", "truth", "lanes"], rr.LineStrips3D(strips, colors=[LANE], radii=0.05))
 
 
 def believed(out: Out, path: list[str], scene: Scene, belief: Belief, colour: Rgb) -> None:
