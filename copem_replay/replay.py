@@ -127,10 +127,11 @@ class Replay:
         """The log as the units of an experiment have it, by configuration."""
         return World(self.scene, self.truth, self._whole, self.recorded, fleet_of(experiment, self.scene).experiment)
 
-    def worlds(self, experiment: Experiment, there: Bool | None) -> Iterator[World]:
-        """The same stretch by stretch, for receivers of the units that are `there (U,)`."""
+    def worlds(self, experiment: Experiment, there: Bool | None, *, measured_only: bool = False) -> Iterator[World]:
+        """The same stretch by stretch, all of it or what is looked at, for receivers of the units `there (U,)`."""
         if self.stretches == (WHOLE,):
-            yield self.world(experiment)
+            whole = self.world(experiment)
+            yield replace(whole, found=self.measured) if measured_only else whole
             return
         lists = self.lists_only(experiment)
         units, seen = lists.experiment, seen_by_all(lists, np.arange(1), states="true")
@@ -139,10 +140,11 @@ class Replay:
         )
         for stretch in self.stretches:
             earliest_s = reach.earliest_s(stretch.from_s)
+            found = self.found(stretch, earliest_s)
             yield World(
                 self.scene,
                 self.truth.captured_between(earliest_s, stretch.until_s),
-                self.found(stretch, earliest_s),
+                found.of_objects(self.looks.object_ix) if measured_only else found,
                 None if self.recorded is None else self.recorded.captured_between(earliest_s, stretch.until_s),
                 units,
                 stretch,
@@ -236,10 +238,11 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | N
     sight_s = _in_sight(replay, experiment, equipped, there)
     events = _by_truth_id(replay, experiment, runs, equipped, there, sight_s)
     appraisals: dict[str, Appraisal] = {}
-    if _needs_all(experiment) or measure.conflict is not None:
+    everything = _needs_all(experiment)
+    if everything or measure.conflict is not None:
         receivers = Receivers(runs, there)
         judges: dict[str, _Judge] = {}
-        for world in replay.worlds(experiment, there):
+        for world in replay.worlds(experiment, there, measured_only=not everything):
             around = _around(replay, world.stretch)
             for name, believed in receivers.believe(world):
                 if name not in judges:

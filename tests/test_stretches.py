@@ -168,6 +168,24 @@ def test_recorded_units(tmp_path: Path) -> None:
     assert_same(whole, pieces)
 
 
+def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() -> None:
+    plan = experiment(
+        runs=3, pems={"sure": NOISY}, configurations={"ideal": {"units": "all", "latency_s": 0.1}},
+        measure={
+            "onset": {"kind": "appears"}, "accuracy": False, "objects": {"classes": ["pedestrian"]},
+            "conflict": {"horizon_s": 3.0, "margin_m": 0.5},
+        },
+    )  # fmt: skip
+    whole, pieces = both_ways(plan, [traffic()], 60)
+    assert len(pieces.replays[0].stretches) > 5
+    assert whole.table["conflict_detection_s"].notna().any()
+    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
+    pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
+    for replay in (whole.replays[0], pieces.replays[0]):
+        worlds = list(replay.worlds(plan, None, measured_only=True))
+        assert {int(k) for world in worlds for k in world.found.tracks.row_object_ix} == pedestrians
+
+
 def test_sweeps() -> None:
     plan = experiment(
         pems={"sure": NOISY}, sweep={"latency_s": [0.0, 0.3], "rate_hz": [5.0]},
