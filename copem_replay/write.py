@@ -48,7 +48,7 @@ def write_mcap(
     family: Family | None = None,
     window: Window | None = None,
 ) -> list[str]:
-    """`source` with the fused lists of one run added, stretch by stretch: `belief[configuration]` has values (1, P).
+    """`source` with the fused lists of one run added, `beliefs` by configuration, stretch by stretch: values (1, P).
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
@@ -118,12 +118,13 @@ def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> It
 def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]:
     """What was detected with each list: detections by the index of the list that was then available."""
     events: dict[int, list[detail.Event]] = {}
-    issue_s = fused.arrives_s[0]
-    for row in table[table["detected"]].to_dict("records"):
-        away_s = np.abs(issue_s - row["detection_s"])
-        frame = int(away_s.argmin()) if len(away_s) else -1
-        if frame < 0 or away_s[frame] > 2e-9 * SAME_INSTANT_NS:  # in another stretch
-            continue
+    issue_s, tolerance_s = fused.arrives_s[0], 2e-9 * SAME_INSTANT_NS
+    if not len(issue_s):
+        return events
+    # The others are of other stretches.
+    here = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
+    for row in table[table["detected"] & here].to_dict("records"):
+        frame = int(np.abs(issue_s - row["detection_s"]).argmin())
         event = {"object": row["object_id"], "first_unit": row["first_unit"]}
         for name in ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m"):
             event[name] = None if row[name] != row[name] else float(row[name])
