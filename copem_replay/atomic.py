@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from copem_replay.errors import OutputError
+from copem_replay.scratch import flush, scratch_for
 
 
 @contextmanager
@@ -19,11 +19,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp") as folder:
-            scratch = Path(folder) / path.name
-            yield scratch
-            with scratch.open("rb") as file:
-                os.fsync(file.fileno())
-            os.replace(scratch, path)
+        with scratch_for(path) as scratch:
+            scratch.will_hold([path.name])
+            yield scratch.path / path.name
+            flush(scratch.path / path.name)
+            os.replace(scratch.path / path.name, path)
+            flush(path.parent)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error

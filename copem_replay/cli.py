@@ -148,28 +148,34 @@ def run(
     ] = None,
 ) -> int:
     """Replay, measure, write the results folder, print the summary."""
-    from copem_replay.results import check_target, write_results
-    from copem_replay.table import summary_text
+    from copem_replay.place import check_inputs, taken
 
     source = _source(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or [], (from_s, to_s))
-    folder = out or Path("out") / experiment.stem
-    check_target(folder, overwrite=overwrite)
-    ready, recordings, skipped = _ready(source, skip_unreadable=skip_unreadable)
-    check_target(folder, overwrite=overwrite, inputs=[experiment, *(recording.path for recording in recordings)])
-    url = _viewer(ready, viewer) if live or viewer is not None else None
-    from copem_replay.run import run as run_experiment
+    with taken(out or Path("out") / experiment.stem, overwrite=overwrite) as place:
+        _complain(f"note: {note}" for note in place.notes)
+        place.notes.clear()
+        ready, recordings, skipped = _ready(source, skip_unreadable=skip_unreadable)
+        check_inputs(place, [experiment, *(recording.path for recording in recordings)])
+        url = _viewer(ready, viewer) if live or viewer is not None else None
+        from copem_replay.results import fill_place
+        from copem_replay.run import run as run_experiment
+        from copem_replay.table import summary_text
 
-    result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
-    notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite, viewer=url)
-    _complain([f"note: {path}: skipped: {reason}" for path, reason in skipped] + [f"note: {note}" for note in notes])
-    print(summary_text(result.summary))
-    if result.sweep is not None:
-        print(_printable(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {folder / 'sweep.csv'}"))
-    print(_printable(f"results in {folder}"))
-    if report:
-        from copem_replay.report import write_report
+        result = _with_progress(
+            lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress)
+        )
+        notes = fill_place(place, ready, recordings, result, skipped=skipped, viewer=url)
+        notes = place.notes + [f"{path}: skipped: {reason}" for path, reason in skipped] + notes
+        _complain(f"note: {note}" for note in notes)
+        print(summary_text(result.summary))
+        if result.sweep is not None:
+            where = place.shown / "sweep.csv"
+            print(_printable(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {where}"))
+        print(_printable(f"results in {place.shown}"))
+        if report:
+            from copem_replay.report import write_report
 
-        print(_printable(f"report in {write_report(folder)}"))
+            print(_printable(f"report in {write_report(place.shown)}"))
     return 1 if skipped else 0
 
 
@@ -391,7 +397,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that has no “×” gets `\\xd7`
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # by way of what has to be tidied up
+    for number in (signal.SIGTERM, signal.SIGHUP):  # by way of what has to be tidied up
+        if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup has it ignored
+            signal.signal(number, lambda number, frame: sys.exit(128 + number))
     sys.exit(_ended())
 
 

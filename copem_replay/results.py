@@ -1,7 +1,7 @@
 """The results folder: complete under its name, or not there at all.
 
-Everything is written into a folder beside it first, which then takes its name. Same input, same seed: the same bytes in
-all but the .rrd.
+Everything is written into a folder beside it first, which then takes its name (`place.py`). Same input, same seed: the
+same bytes in all but the .rrd.
 """
 
 from __future__ import annotations
@@ -9,10 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
-import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,10 +17,12 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.accuracy_tables import AccuracyTables
+from copem_replay.belongings import MARK
 from copem_replay.check import place_of
 from copem_replay.digest import sha256_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
+from copem_replay.place import EXPERIMENT, Place, check_inputs, taken
 from copem_replay.plain_yaml import dump
 from copem_replay.read import Recording
 from copem_replay.run import Result, log_path_of
@@ -33,40 +32,7 @@ _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
     "scipy", "shapely",
 )  # fmt: skip
-_MARK = "provenance.json"
-_EXPERIMENT = "experiment.yaml"
-
-
-def check_target(folder: Path, *, overwrite: bool, inputs: Sequence[Path] = ()) -> None:
-    """Whether a results folder may be written here, and `inputs` stay where they are. Raises OutputError."""
-    try:
-        parent = next((place for place in Path(os.path.abspath(folder)).parents if place.exists()), Path("/"))
-        exists = folder.exists()
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
-    if not parent.is_dir():
-        raise OutputError(f"{folder}: cannot be written: {parent} is a file")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder}: cannot be written: no permission to write in {parent}")
-    if not exists:
-        return
-    if not folder.is_dir():
-        raise OutputError(f"{folder}: expected a folder for the results, found a file")
-    if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
-        raise OutputError(f"{folder}: cannot be written: no permission to replace what is in it")
-    empty = not any(folder.iterdir())
-    if not empty and not (folder / _MARK).exists():
-        raise OutputError(f"{folder}: not empty and no results folder; choose another with --out")
-    if not empty and not overwrite:
-        raise OutputError(
-            f"{folder}: results are there already; --overwrite replaces them, --out chooses another folder"
-        )
-    place = folder.resolve()
-    if place.is_mount() or place in (Path.cwd(), *Path.cwd().parents):
-        raise OutputError(f"{folder}: cannot be replaced, being in use or a mount point; choose a folder in it")
-    for path in inputs:
-        if path.resolve().is_relative_to(place) and path.resolve() != place / _EXPERIMENT:
-            raise OutputError(f"{folder}: {path} is in it and would go with it; choose another folder with --out")
+_ACCURACY = ("accuracy", "instants", "lists", "thresholds")
 
 
 def write_results(
@@ -83,22 +49,47 @@ def write_results(
 
     `viewer`: where a Rerun viewer listens that shall get what is written to .rrd, too.
     """
-    check_target(folder, overwrite=overwrite, inputs=[recording.path for recording in recordings])
-    folder = folder.resolve()
+    with taken(folder, overwrite=overwrite) as place:
+        check_inputs(place, [recording.path for recording in recordings])
+        notes = fill_place(place, experiment, recordings, result, skipped=skipped, viewer=viewer)
+        return place.notes + notes
+
+
+def fill_place(
+    place: Place,
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    result: Result,
+    *,
+    skipped: Sequence[tuple[Path, str]] = (),
+    viewer: str | None = None,
+) -> list[str]:
+    """The same into a place that is taken, whose `folder` and `notes` may change. Raises OutputError."""
+    files = _files(experiment, recordings, result)
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".tmp"))
+        place.will_hold(files)
+        notes = _fill(place.new, place.folder, experiment, recordings, result, skipped, viewer)
+        place.finish(files)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from None
-    try:
-        scratch.chmod(0o777 & ~_umask())
-        notes = _fill(scratch, folder, experiment, recordings, result, skipped, viewer)
-        _replace(scratch, folder)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        raise OutputError(f"{place.folder}: cannot be written: {error.strerror or error}") from error
     return notes
+
+
+def _files(experiment: Experiment, recordings: Sequence[Recording], result: Result) -> list[str]:
+    """What is going to be in the folder, by names relative to it."""
+    files = [EXPERIMENT, MARK, "detections.parquet", "summary.csv"]
+    files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
+    if result.accuracy is not None:
+        files += [f"{name}.parquet" for name in _ACCURACY if getattr(result.accuracy, name) is not None] + ["bands.csv"]
+    for log in shown_logs(experiment, result):
+        for shown in shown_runs(experiment, result, log):
+            files += [f"{_target(shown, log, recordings)}.{kind}" for kind in ("mcap", "rrd")]
+    return sorted(files)
+
+
+def _target(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
+    """What the files of a run that is shown are called, relative to the folder, without their suffix."""
+    return shown.stem if len(recordings) == 1 else f"{shown.stem}/{log}"
 
 
 def _fill(
@@ -107,7 +98,7 @@ def _fill(
 ) -> list[str]:  # fmt: skip
     data = experiment.as_written()
     data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
-    (scratch / _EXPERIMENT).write_text(dump(data), encoding="utf-8")
+    (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
     write_csv(result.summary, scratch / "summary.csv")
     if result.exact is not None:
@@ -119,11 +110,11 @@ def _fill(
     notes = list(result.notes)
     for log in shown_logs(experiment, result):
         for shown in shown_runs(experiment, result, log):
-            target = scratch / shown.stem if len(recordings) == 1 else scratch / shown.stem / log
+            target = scratch / _target(shown, log, recordings)
             said = _show(target, log, shown, experiment, recordings, result, viewer)
             notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
     provenance = provenance_of(experiment, recordings, result, skipped, notes)
-    (scratch / _MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (scratch / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return notes
 
 
@@ -206,6 +197,7 @@ def provenance_of(
             for log, runs in shown.items()
         },
         "notes": list(notes),
+        "files": _files(experiment, recordings, result),
     }  # fmt: skip
 
 
@@ -225,7 +217,7 @@ def write_parquet(table: Any, path: Path) -> None:
 
 
 def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
-    for name in ("accuracy", "instants", "lists", "thresholds"):
+    for name in _ACCURACY:
         if (table := getattr(tables, name)) is not None:
             write_parquet(table, scratch / f"{name}.parquet")
     write_csv(tables.bands, scratch / "bands.csv")
@@ -234,27 +226,3 @@ def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
 def write_csv(table: pd.DataFrame, path: Path) -> None:
     """A table as CSV: nulls empty, numbers with nine significant digits."""
     table.to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _replace(scratch: Path, folder: Path) -> None:
-    """Give `scratch` the name `folder`. What was there goes only when the new one is complete."""
-    if not folder.exists():
-        os.replace(scratch, folder)
-        return
-    old = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".old"))
-    try:
-        os.replace(folder, old / folder.name)
-        try:
-            os.replace(scratch, folder)
-        except BaseException:
-            with suppress(OSError):
-                os.replace(old / folder.name, folder)
-            raise
-    finally:
-        shutil.rmtree(old, ignore_errors=True)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 import pytest
 
-from copem_replay import cli, plain_yaml, results, run
+from copem_replay import cli, place, plain_yaml, results, run
 from copem_replay.compare import compare, comparison_markdown, comparison_text
 from copem_replay.experiment_file import load, parse
 from experiments import TEXT, changed, drive
@@ -784,11 +784,20 @@ class TestTarget:
             ("", ".: not empty and no results folder; choose another with --out"),
             ("/", "/: not empty and no results folder; choose another with --out"),
             ("x" * 300, "x" * 300 + ": cannot be written: File name too long"),
-            ("x" * 250, "{here}/" + "x" * 250 + ": cannot be written: File name too long"),
+            ("x" * 256 + "/e", "x" * 256 + "/e: cannot be written: File name too long"),
+            ("loop", "loop: cannot be written: Too many levels of symbolic links"),
+            ("loop/e", "loop/e: cannot be written: Too many levels of symbolic links"),
+            ("x/" * 2000, "x/" * 1999 + "x: cannot be written: its whole path has more than 3496 bytes"),
             ("/proc/x", "/proc/x: cannot be written: No such file or directory"),
         ],
     )
-    def test_where_nothing_can_be_written(self, here: Path, call: Call, out: str, said: str) -> None:
+    def test_where_nothing_can_be_written(
+        self, here: Path, call: Call, out: str, said: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Said before anything is replayed."""
+        monkeypatch.setattr(run.replays, "outcomes", raising(AssertionError("replayed")))
+        (here / "loop").symlink_to("pool")
+        (here / "pool").symlink_to("loop")
         before = sorted(os.listdir(here))
         ended = call("run", "e.yaml", "--out", out, "--overwrite")
         assert ended == (2, "", [said.format(here=here)])
@@ -899,7 +908,7 @@ class TestFailure:
         assert left == (["e"] if "--overwrite" in arguments else [])
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
-    @pytest.mark.parametrize("step", ["write_csv", "provenance_of", "_replace"])
+    @pytest.mark.parametrize("step", ["write_csv", "provenance_of"])
     def test_while_writing(
         self, here: Path, call: Call, arguments: list[str], failure: Failure, step: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -914,33 +923,59 @@ class TestFailure:
         self.fails(here, call, arguments, failure)
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
+    @pytest.mark.parametrize("in_one_step", [True, False])
     def test_while_giving_the_folder_its_name(
-        self, here: Path, call: Call, arguments: list[str], failure: Failure, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        replace = os.replace
-        for step in range(2 if "--overwrite" in arguments else 1):
+        self, here: Path, call: Call, arguments: list[str], failure: Failure, in_one_step: bool,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:  # fmt: skip
+        """Where folders can be exchanged, and where they are moved in two steps: each of the steps fails."""
+        rename = os.rename
+        monkeypatch.setattr(place, "exchange", raising(failure.error) if in_one_step else lambda *_: False)
+        for step in range(2 if "--overwrite" in arguments and not in_one_step else 1):
             count = iter(range(9))
 
             def fails(source: Any, target: Any, step: int = step, count: Iterator[int] = count) -> None:
                 if next(count) == step:
                     raise failure.error
-                replace(source, target)
+                rename(source, target)
 
-            monkeypatch.setattr(os, "replace", fails)
+            monkeypatch.setattr(os, "rename", fails)
             self.fails(here, call, arguments, failure)
 
-    def test_termination_is_a_failure_like_any_other(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        previous = signal.getsignal(signal.SIGTERM)
-        monkeypatch.setattr(results, "write_csv", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+    def test_termination_is_a_failure_like_any_other(
+        self, here: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+    ) -> None:
+        monkeypatch.setattr(results, "write_csv", lambda *_: os.kill(os.getpid(), number))
+        with pytest.raises(SystemExit) as ended:
+            self.main(here, monkeypatch)
+        assert ended.value.code == 128 + number
+        assert sorted(os.listdir(here)) == ["drive.mcap", "e.yaml"]
+
+    def test_a_terminal_that_goes_does_not_end_what_was_told_to_go_on(
+        self, here: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """`nohup copem-replay run …`."""
+        monkeypatch.setattr(results, "write_csv", lambda *_: os.kill(os.getpid(), signal.SIGHUP))
+        previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        try:
+            with pytest.raises(SystemExit) as ended:
+                self.main(here, monkeypatch)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        finally:
+            signal.signal(signal.SIGHUP, previous)
+        assert ended.value.code == 0
+        assert (here / "out/e/provenance.json").exists()
+
+    def main(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
         monkeypatch.chdir(here)
         monkeypatch.setattr(sys, "argv", ["copem-replay", "run", "e.yaml"])
         try:
-            with pytest.raises(SystemExit) as ended:
-                cli.main()
+            cli.main()
         finally:
-            signal.signal(signal.SIGTERM, previous)
-        assert ended.value.code == 128 + signal.SIGTERM
-        assert os.listdir(here / "out") == []
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
     def test_a_defect_shows_where_it_is(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("copem_replay.info.survey", raising(ZeroDivisionError("division by zero")))
@@ -955,7 +990,7 @@ class TestFailure:
         ended = call("run", "e.yaml")
         assert ended.code == 2
         assert len(ended.lines) == 1
-        assert os.listdir(here / "out") == []
+        assert not (here / "out").exists()
 
 
 def raising(error: BaseException) -> Callable[..., None]:
