@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from copem_replay.errors import OutputError
+from copem_replay.errors import InputError, OutputError
 from copem_replay.scratch import is_scratch
 
 MARK = "provenance.json"
@@ -44,6 +44,16 @@ def belongings(folder: Path) -> Belongings | None:
         return None
     listed = said.get("files")
     return Belongings(frozenset(map(str, listed)) if isinstance(listed, list) else None, tuple(names_in(folder)))
+
+
+def check_still(folder: Path, seen: os.stat_result) -> None:
+    """Raise InputError where other results have taken the place of those that were read."""
+    try:
+        same = os.path.samestat(os.stat(folder), seen)
+    except OSError:
+        same = False
+    if not same:
+        raise InputError(f"{folder}: other results took its place while it was read; do it once more")
 
 
 def names_in(folder: Path, at: str = "") -> Iterator[str]:

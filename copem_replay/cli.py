@@ -20,6 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
+import copem_replay
 from copem_replay.errors import CopemError, InputError, OutputError
 
 app = typer.Typer(
@@ -225,6 +226,7 @@ def compare(
         write_comparison(comparison, out)
     for file in (out, rrd):
         if file is not None:
+            _tidied(file)
             print(_printable(f"written to {file}"))
     return 0
 
@@ -248,6 +250,9 @@ def plot(
     names = None if configurations is None else [name.strip() for name in configurations.split(",")]
     files, notes = write_figures(load_results(folder), out, configurations=names, log=log, object_id=object, run=run)
     _complain(f"note: {note}" for note in notes)
+    figures = out or folder / "figures"
+    _tidied(figures, figures)
+    _tidied(figures)
     _print_blocks([[str(file) for file in files]])
     return 0
 
@@ -263,7 +268,9 @@ def report(
     """What a results folder says, as one HTML file that opens offline: words, tables, figures, provenance."""
     from copem_replay.report import write_report
 
-    print(_printable(f"report in {write_report(folder, out, baseline=baseline)}"))
+    path = write_report(folder, out, baseline=baseline)
+    _tidied(path)
+    print(_printable(f"report in {path}"))
     return 0
 
 
@@ -348,6 +355,13 @@ def _ready(source: Any, *, skip_unreadable: bool) -> tuple[Any, Any, list[tuple[
     return experiment, recordings, [(log.path, log.reason) for log in refused]
 
 
+def _tidied(path: Path, place: Path | None = None) -> None:
+    """Remove what killed commands left of a file or folder beside it, or in `place`, and say so."""
+    from copem_replay.scratch import remove_leftovers
+
+    _complain(f"note: {note}" for note in remove_leftovers(path, place))
+
+
 def _viewer(experiment: Any, url: str | None) -> str:
     """Where a viewer listens; refused before the replay where there is none, or nothing to show in it."""
     from copem_replay.show import VIEWER, check_viewer
@@ -400,7 +414,10 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):  # by way of what has to be tidied up
         if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup has it ignored
             signal.signal(number, lambda number, frame: sys.exit(128 + number))
-    sys.exit(_ended())
+    code = _ended()
+    if copem_replay.CACHE_NOTE is not None and "numba" in sys.modules:  # something may have been compiled
+        _complain([f"note: {copem_replay.CACHE_NOTE}"])
+    sys.exit(code)
 
 
 def _ended() -> int:
@@ -428,6 +445,11 @@ def _ended() -> int:
         if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | FileExistsError):
             _discard_output()  # a full disk, a device that fails, no permission: none of our doing
             _complain([f"copem-replay: {f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"])
+            return 2
+        if isinstance(error, RuntimeError) and str(error).startswith("cannot cache function"):  # Numba's words
+            _complain(
+                ["copem-replay: no folder to cache compiled code in; set NUMBA_CACHE_DIR to one that can be written"]
+            )
             return 2
         traceback.print_exc()
         print("copem-replay: this is a defect of copem_replay; please report it with the lines above", file=sys.stderr)

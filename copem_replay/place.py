@@ -89,7 +89,7 @@ class Place:
         kept: dict[str, str] = {}
         same: dict[str, str] = {}
         self.scratch.will_hold(removable, {f"{_NEW}/{name}": f"{self.folder.name}/{name}" for name in others})
-        for name in others:
+        for name in sorted(others, key=lambda name: name in files):  # what need not give way, first
             kept[name] = keep(name, self.folder, self.new, self.scratch.path / _SPARE)
             if kept[name] != name:
                 self.notes.append(f"{self.asked}/{name}: kept as {kept[name]}, as the results have one of that name")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from copem_replay.belongings import check_still
 from copem_replay.errors import InputError
 from copem_replay.measure_keys import Measure
 from copem_replay.plain_yaml import NotYamlError, read
@@ -99,6 +101,7 @@ def read_folder(path: Path) -> Folder:
     for name in ("provenance.json", "experiment.yaml", "detections.parquet"):
         if not (path / name).is_file():
             raise InputError(f"{path}: expected a results folder, found no {name} in it; `copem-replay run` writes one")
+    seen = os.stat(path)
     fields = _provenance(path / "provenance.json")
     columns = _DETECTIONS | (_BRAKING if fields["braking"] is not None else {})
     if _rowless(path / "detections.parquet"):
@@ -106,6 +109,7 @@ def read_folder(path: Path) -> Folder:
     tables = {"detections.parquet": _table(path / "detections.parquet", columns)}
     tables |= {name: _table(path / name, of) for name, of in OPTIONAL.items() if (path / name).is_file()}
     experiment = _experiment(path / "experiment.yaml")
+    check_still(path, seen)
     always = bool(fields["measure"]["match"].get("always"))
     by_id = frozenset() if always else frozenset(_by_truth_id(experiment.get("configurations")))
     return Folder(path=path, ego=experiment.get("ego"), by_truth_id=by_id, tables=tables, **fields)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from copem_replay.belongings import check_still
 from copem_replay.errors import InputError
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import Source, load, parse
@@ -44,6 +46,7 @@ class Results:
     run_shown: dict[str, int]  # by log
     exact: pd.DataFrame | None
     sweep: pd.DataFrame | None
+    seen: os.stat_result  # the folder it was read from
 
     @property
     def name(self) -> str:
@@ -73,6 +76,7 @@ def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
             raise InputError(
                 f"{folder}: expected a results folder, found no {name} in it; `copem-replay run` writes one"
             )
+    seen = os.stat(folder)
     source = load(folder / "experiment.yaml")
     experiment, problems = parse(source)
     if experiment is None or problems:
@@ -88,7 +92,7 @@ def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
         raise InputError(
             f"{folder}/provenance.json: expected {len(places)} logs as in experiment.yaml, found {len(names)}; {_AGAIN}"
         )
-    return Results(
+    results = Results(
         folder,
         source,
         experiment,
@@ -98,7 +102,10 @@ def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
         run_shown,
         _read(exact, pd.read_parquet, _EXACT) if exact.is_file() else None,
         _read(sweep, _csv, ("sweep", "value", "configuration", "list_rate_hz")) if sweep.is_file() else None,
+        seen,
     )
+    check_still(folder, seen)
+    return results
 
 
 def _csv(path: Path) -> pd.DataFrame:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from copem_replay.belongings import check_still
 from copem_replay.errors import OutputError, RecordingError
 from copem_replay.plot.appearance import style
 from copem_replay.plot.choice import choose
@@ -19,10 +18,12 @@ from copem_replay.plot.distances import distances_figure
 from copem_replay.plot.folder import Results
 from copem_replay.plot.runs import runs_figure
 from copem_replay.plot.sweeps import sweeps_figure
+from copem_replay.scratch import flush_all, scratch_for
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_FIGURES = ("runs", "distances", "curves", "sweeps")
 _METADATA = {
     ".png": {"Software": None},  # the version of matplotlib
     ".svg": {"Date": None, "Creator": None},
@@ -62,14 +63,19 @@ def write_figures(
     with _scratch_beside(folder) as scratch:
         for name, figure in figures.items():
             try:
-                _save(figure(), scratch / name)
+                drawn = figure()
+                check_still(results.folder, results.seen)
+                _save(drawn, scratch / name)
             except RecordingError as error:
                 notes += [f"no figure of runs: {problem}" for problem in error.problems]
-        made = sorted(scratch.iterdir(), key=lambda path: ([*figures].index(path.stem), path.suffix))
+        made = [scratch / f"{name}{suffix}" for name in figures for suffix in sorted(_METADATA)]
+        made = [path for path in made if path.exists()]
+        flush_all(scratch)
+        check_still(results.folder, results.seen)
         folder.mkdir(exist_ok=True)
         for path in made:
             os.replace(path, folder / path.name)
-        for name in ("runs", "distances", "curves", "sweeps"):  # what an earlier call made of other results
+        for name in _FIGURES:  # what an earlier call made of other results
             for suffix in _METADATA:
                 if not any(path.name == name + suffix for path in made):
                     (folder / (name + suffix)).unlink(missing_ok=True)
@@ -98,17 +104,10 @@ def _scratch_beside(folder: Path) -> Iterator[Path]:
                 f"{folder}: cannot be written: expected a folder, found a file; choose another with --out"
             )
         folder.parent.mkdir(parents=True, exist_ok=True)
-        place = folder if folder.is_dir() else folder.parent
-        scratch = Path(tempfile.mkdtemp(dir=place, prefix=f".{folder.name}.", suffix=".tmp"))
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be written: {error.strerror or error}; choose another with --out"
-        ) from None
-    try:
-        yield scratch
+        with scratch_for(folder, folder if folder.is_dir() else folder.parent) as scratch:
+            scratch.will_hold(f"{name}{suffix}" for name in _FIGURES for suffix in _METADATA)
+            yield scratch.path
     except OSError as error:
         raise OutputError(
             f"{folder}: cannot be written: {error.strerror or error}; choose another with --out"
         ) from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)

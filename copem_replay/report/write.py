@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from copem_replay.atomic import atomic_file
+from copem_replay.belongings import check_still
 from copem_replay.errors import OutputError
 
 REPORT = "report.html"
@@ -29,7 +30,9 @@ def write_report(folder: Path, out: Path | None = None, *, baseline: str | None 
 
     path = folder / REPORT if out is None else out
     check_report(path)
-    html = page(load_study(folder, baseline))
+    study = load_study(folder, baseline)
+    html = page(study)
     with atomic_file(path) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
+        check_still(folder, study.results.seen)
     return path
