@@ -1,0 +1,231 @@
+"""Kill runs at many moments, as `kill -9` does, and look at what is left: `python tools/kill_runs.py --kills 300`.
+
+Half of the moments are numbered steps (a file opened, a folder made, a name given or taken where the results go: what
+Python tells its audit hooks of), half random times. After each kill, the results folder is either what it was or what
+it was going to be, and a file of the user's is in it; a run after that gives the same bytes as ever, and leaves nothing
+beside the folder. The .rrd, whose bytes differ from run to run, has to be there. `--two-steps`: as where folders cannot
+be exchanged; then, for an instant, nothing has the folder's name, and the next run puts it back.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+_STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", "os.scandir"}
+_NOTE = "notes.txt"
+Files = dict[str, bytes]
+
+
+@dataclass
+class Found:
+    """What was looked at, and what was wrong."""
+
+    kills: int = 0
+    unscathed: int = 0  # the run had ended before it was to be killed
+    nothing: int = 0  # of those killed: no folder, as before
+    old: int = 0
+    new: int = 0
+    gaps: int = 0  # neither, between two steps
+    leftovers: int = 0  # kills after which something stood beside the folder
+    wrong: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        told = f"{self.kills} kills, {self.unscathed} after the run had ended: no folder as before {self.nothing}, "
+        told += f"old {self.old}, new {self.new}, between two steps {self.gaps}"
+        return f"{told}; something beside it {self.leftovers}; wrong: {len(self.wrong)}"
+
+
+class Trial:
+    """An experiment in a folder of its own, run by forks of this process, which has imported all and runs nothing."""
+
+    def __init__(self, here: Path, experiment: Path, *, two_steps: bool) -> None:
+        self.two_steps = two_steps
+        self.here, self.experiment, self.out = here, experiment, here / "out/e"
+        self.expected: dict[int, Files] = {}
+
+    def forked(self, seed: int, before: Callable[[], None] = lambda: None) -> int:
+        """Begin a run; the process that does it."""
+        child = os.fork()
+        if child:
+            return child
+        try:
+            from copem_replay import cli, place
+
+            if self.two_steps:
+                place.exchange = lambda *_: False
+            nothing = os.open(os.devnull, os.O_RDWR)
+            for fd in (1, 2):
+                os.dup2(nothing, fd)
+            os.chdir(self.here)
+            sys.argv = ["copem-replay", "run", str(self.experiment), "--overwrite", "--seed", str(seed)]
+            sys.argv += ["--out", str(self.out), "--jobs", "1"]
+            before()
+            os._exit(cli._ended())
+        except BaseException:
+            os._exit(99)
+
+    def run(self, seed: int) -> None:
+        """A run from beginning to end."""
+        code = ended(self.forked(seed))
+        if code != 0:
+            raise SystemExit(f"a run that was not killed ended with {code}")
+
+    def steps(self, seed: int) -> int:
+        """How many steps a run has."""
+        counter = self.here / "steps"
+        child = self.forked(seed, lambda: self.kill_at(None, counter))
+        if ended(child) != 0:
+            raise SystemExit("the run whose steps were counted failed")
+        return len(counter.read_bytes())
+
+    def kill_at(self, last: int | None, counter: Path) -> None:
+        """Kill this process before its step `last`; None: count its steps into a file."""
+        out = os.open(counter, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) if last is None else -1
+        count, where = 0, str(self.out.parent)
+
+        def hook(event: str, arguments: tuple[object, ...]) -> None:
+            nonlocal count
+            if event not in _STEPS or not any(str(each).startswith(where) for each in arguments[:2]):
+                return
+            if last is None:
+                os.write(out, b".")
+            elif count == last:
+                os.kill(os.getpid(), signal.SIGKILL)
+            count += 1
+
+        sys.addaudithook(hook)
+
+    def files(self) -> Files:
+        """What is in the results folder; of an .rrd that it is there."""
+        paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
+        return {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
+
+    def look(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
+        """What a killed run left: it is that of one of two seeds (None: there was nothing)."""
+        found.leftovers += len(os.listdir(self.out.parent)) > self.out.exists() if self.out.parent.exists() else 0
+        before, seed = seeds
+        files = self.files()
+        if not self.out.exists() and (before is None or self.two_steps):
+            found.nothing += before is None
+            found.gaps += before is not None
+            return
+        mine = files.pop(_NOTE, None)
+        if before is not None and mine != b"mine\n":
+            found.wrong.append(f"{what}: {_NOTE} is gone")
+        if files == self.expected[seed]:
+            found.new += 1
+        elif before is not None and files == self.expected[before]:
+            found.old += 1
+        else:
+            found.wrong.append(f"{what}: half-written: {sorted(files)}")
+
+    def look_again(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
+        """After a run from beginning to end: the same bytes, and nothing beside the folder."""
+        before, seed = seeds
+        self.run(seed)
+        files = self.files()
+        if files.pop(_NOTE, None) != (None if before is None else b"mine\n"):
+            found.wrong.append(f"{what}: {_NOTE} is gone after the next run")
+        if files != self.expected[seed]:
+            found.wrong.append(f"{what}: the run after it gave other results")
+        if (left := sorted(os.listdir(self.out.parent))) != [self.out.name]:
+            found.wrong.append(f"{what}: left for good: {left}")
+
+
+def ended(child: int) -> int | None:
+    """How a child ended; None: it was killed."""
+    _, status = os.waitpid(child, 0)
+    return None if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
+
+
+def imported() -> None:
+    """Import what a run imports: its forks need not."""
+    import copem_replay.cli
+    import copem_replay.place
+    import copem_replay.report
+    import copem_replay.results
+    import copem_replay.show
+    import copem_replay.table
+    import copem_replay.write  # noqa: F401
+
+
+def kill(
+    here: Path, experiment: Path, kills: int, seed: int = 1, *, two_steps: bool = False, progress: bool = False
+) -> Found:
+    """Kill so many runs: half at steps spread over all there are, half after random times; every tenth a first run."""
+    imported()
+    dice = random.Random(seed)
+    trial, found = Trial(here, experiment, two_steps=two_steps), Found()
+    for number in (1, 2):
+        trial.run(number)
+        trial.expected[number] = trial.files()
+    (trial.out / _NOTE).write_text("mine\n")
+    begin = time.perf_counter()
+    trial.run(2)
+    takes_s = time.perf_counter() - begin
+    steps = trial.steps(2)
+    counted = [dice.randrange(k * steps // (kills // 2), (k + 1) * steps // (kills // 2)) for k in range(kills // 2)]
+    moments: list[int | float] = [*counted, *(dice.uniform(0, takes_s) for _ in range(kills - len(counted)))]
+    dice.shuffle(moments)
+    there: int | None = 2
+    for k, moment in enumerate(moments):
+        if k % 10 == 9:
+            for path in sorted(trial.out.rglob("*"), reverse=True):
+                path.rmdir() if path.is_dir() else path.unlink()
+            trial.out.rmdir()
+            there = None
+        new = 1 if there == 2 else 2
+        what = f"kill {k} {'before step' if isinstance(moment, int) else 'after s'} {moment:.6g}"
+        if isinstance(moment, int):
+            child = trial.forked(new, lambda last=moment: trial.kill_at(last, here / "steps"))
+        else:
+            child = trial.forked(new)
+            time.sleep(moment)
+            os.kill(child, signal.SIGKILL)
+        found.kills += 1
+        found.unscathed += ended(child) is not None
+        trial.look((there, new), found, what)
+        trial.look_again((there, new), found, what)
+        (trial.out / _NOTE).write_text("mine\n")
+        there = new
+        if progress:
+            print(f"{what}: {found}", flush=True)
+    return found
+
+
+def main() -> None:
+    sys.path.insert(0, str(ROOT / "tests"))
+    from experiments import changed, drive
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--two-steps", action="store_true")
+    parser.add_argument("--verbose", action="store_true")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        here = Path(folder)
+        drive(here / "drive.mcap")
+        (here / "e.yaml").write_text(changed("show: {run: 0}"))
+        begin = time.perf_counter()
+        found = kill(
+            here, here / "e.yaml", arguments.kills, arguments.seed, two_steps=arguments.two_steps,
+            progress=arguments.verbose,
+        )  # fmt: skip
+        print(f"{found}; {time.perf_counter() - begin:.0f} s")
+        print("\n".join(found.wrong), end="")
+        sys.exit(bool(found.wrong))
+
+
+if __name__ == "__main__":
+    main()
