@@ -20,7 +20,7 @@ from copem_replay import run as runs
 from copem_replay.atomic import atomic_file
 from copem_replay.errors import OutputError
 from experiments import TEXT, changed, drive
-from test_cli import Call, Ended, call, here, installed, written
+from test_cli import ROOT, Call, Ended, call, here, installed, written
 
 __all__ = ["call", "here"]  # fixtures
 
@@ -452,3 +452,14 @@ def test_tables_of_old_and_new_results_are_not_read_as_one(
         2,
         "out/e: other results took its place while it was read; do it once more",
     )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("two_steps", [False, True])
+def test_killed_at_any_moment(two_steps: bool) -> None:
+    """Nothing half-written, nothing of the user's gone, nothing piling up, the next run as if there had been none."""
+    tool = [sys.executable, ROOT / "tools/kill_runs.py", "--kills", "20"]
+    ended = subprocess.run([*tool, *["--two-steps"] * two_steps], capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert ended.stdout.startswith("20 kills, ")
+    assert "wrong: 0;" in ended.stdout

@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +47,7 @@ class Found:
 
 
 class Trial:
-    """An experiment in a folder of its own, run by forks of this process, which has imported all and runs nothing."""
+    """An experiment in a folder of its own, run by forks of this process, which has loaded what they need."""
 
     def __init__(self, here: Path, experiment: Path, *, two_steps: bool) -> None:
         self.two_steps = two_steps
@@ -148,22 +149,29 @@ def ended(child: int) -> int | None:
     return None if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
 
 
-def imported() -> None:
-    """Import what a run imports: its forks need not."""
-    import copem_replay.cli
+def warmed(path: Path) -> None:
+    """Import and load what a run needs, so that forks need not: all but Rerun's threads, which no fork would have."""
     import copem_replay.place
-    import copem_replay.report
     import copem_replay.results
     import copem_replay.show
     import copem_replay.table
     import copem_replay.write  # noqa: F401
+    from copem_replay.check import problems, read_logs
+    from copem_replay.experiment_file import load, log_paths
+    from copem_replay.run import run
+
+    source = load(path)
+    experiment, _ = problems(source)
+    assert experiment is not None
+    recordings, _ = read_logs(experiment, log_paths(source)[0], source)
+    run(experiment, recordings)
 
 
 def kill(
     here: Path, experiment: Path, kills: int, seed: int = 1, *, two_steps: bool = False, progress: bool = False
 ) -> Found:
     """Kill so many runs: half at steps spread over all there are, half after random times; every tenth a first run."""
-    imported()
+    warmed(experiment)
     dice = random.Random(seed)
     trial, found = Trial(here, experiment, two_steps=two_steps), Found()
     for number in (1, 2):
@@ -174,7 +182,8 @@ def kill(
     trial.run(2)
     takes_s = time.perf_counter() - begin
     steps = trial.steps(2)
-    counted = [dice.randrange(k * steps // (kills // 2), (k + 1) * steps // (kills // 2)) for k in range(kills // 2)]
+    ends = [k * steps // (kills // 2) for k in range(kills // 2 + 1)]
+    counted = [dice.randrange(low, max(high, low + 1)) for low, high in pairwise(ends)]
     moments: list[int | float] = [*counted, *(dice.uniform(0, takes_s) for _ in range(kills - len(counted)))]
     dice.shuffle(moments)
     there: int | None = 2
