@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
-from copem_replay.plain_yaml import Key, NotYamlError, read
+from copem_replay.plain_yaml import AliasesError, Key, NotYamlError, read
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,8 @@ def load(path: Path) -> Source:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
     try:
         data, lines, problems = read(text)
+    except AliasesError as error:
+        raise ExperimentError(f"{path}:{error.line}: {error.why}") from None
     except NotYamlError as error:
         raise ExperimentError(f"{path}:{error.line}: not YAML: {error.why}") from None
     if not isinstance(data, dict):

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+import re
+import tracemalloc
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -233,6 +235,35 @@ class TestStrangeYaml:
     def test_something_that_holds_itself(self, tmp_path: Path) -> None:
         found = problems(tmp_path, changed("logs: &logs [*logs]"))
         assert found[0] == "2: logs[0]: an alias of something that holds it"
+
+    @pytest.mark.parametrize(
+        "inner", ["[*{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}]", "{{a: *{0}, b: *{0}}}"]
+    )
+    def test_aliases_of_aliases_of_aliases(self, tmp_path: Path, inner: str) -> None:
+        """Ten of ten, ten times over, are ten thousand million values; two of two, forty times, a million million."""
+        depth = 10 if inner.startswith("[") else 40
+        bomb = "".join(f"a{k + 1}: &a{k + 1} {inner.format(f'a{k}')}\n" for k in range(depth))
+        tracemalloc.start()
+        try:
+            said = refusal(tmp_path, "a0: &a0 [lol]\n" + bomb)
+            assert tracemalloc.get_traced_memory()[1] < 200e6
+        finally:
+            tracemalloc.stop()
+        assert re.fullmatch(
+            r"\d+: expected aliases that stand for at most 200000 characters and values in all, found more .*", said
+        )
+
+    def test_a_long_text_that_is_repeated(self, tmp_path: Path) -> None:
+        said = refusal(tmp_path, f"a: &a {'x' * 50_000}\nb: [*a, *a, *a, *a]\n")
+        assert said.startswith("1: expected aliases that stand for at most 200000 characters")
+
+    def test_a_couple_that_a_hundred_pems_share(self, tmp_path: Path) -> None:
+        first, _, rest = TEXT.partition("units:")
+        pems = "".join(f"  p{k}: *shared\n" for k in range(100))
+        shared = first.replace("  onboard:\n", "  onboard: &shared\n") + pems + "units:" + rest
+        found = experiment(tmp_path, shared)
+        assert len(found.pems) == 101
+        assert found.pems["p99"] == found.pems["onboard"]
 
     @pytest.mark.parametrize("key", ["[1, 2]", "{a: 1}"])
     def test_key_that_is_no_scalar(self, tmp_path: Path, key: str) -> None:
