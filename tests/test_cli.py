@@ -489,7 +489,7 @@ class TestOptions:
         assert ended.code == 2
         assert ended.lines == ["--runs: expected at most 1e+09, found 1" + "0" * 30]
 
-    @pytest.mark.parametrize("seed", ["-5", "0", "123456789012345678901234567890"])
+    @pytest.mark.parametrize("seed", ["-5", "0", "18446744073709551615"])
     def test_seed(self, here: Path, call: Call, seed: str) -> None:
         assert call("run", "e.yaml", "--runs", "50", "--out", "one").code == 0
         assert call("run", "e.yaml", "--runs", "50", "--seed", seed, "--out", "two").code == 0
@@ -537,7 +537,7 @@ class TestOptions:
         [
             ("none.mcap", "none.mcap: no such file"),
             ("x*.mcap", "--log: no file matches 'x*.mcap'"),
-            ("e.yaml", "e.yaml: expected an MCAP file, found one that starts with b'version: 1\\nlogs:'"),
+            ("e.yaml", "e.yaml: expected an MCAP file, found text that begins with 'version: 1'"),
             (".", REINDEX),
             ("", REINDEX),
             ("x" * 300, "x" * 300 + ": no such file"),
@@ -1160,7 +1160,7 @@ class TestExtremes:
             "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 0.001}",
             "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 999.9, phase_s: 1e-300}",
             "  ego: {on: ego, height_m: 1, pem: onboard, offset_m: [1e12, -1e12]}",
-            "    - when: {range_m: [0, 1e12], azimuth_deg: [-1e12, 1e12], visible_share: [1, 1]}",
+            "    - when: {range_m: [0, 1e12], azimuth_deg: [-360, 360], visible_share: [1, 1]}",
             "      error: {kind: gaussian, covariance_m2: [[1e12, 0], [0, 1e12]], mean_m: [1e12, 1e12]}",
             "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",
