@@ -109,15 +109,11 @@ def check(
     """Every problem of an experiment file at once, with file and line, against its logs too."""
     source = _source(experiment, {"ego": ego}, log or [], (from_s, to_s))
     wanted, recordings, _skipped = _ready(source, skip_unreadable=False)
-    if wanted.measure.exact and wanted.measure.confirm.hits > 1:  # whether that can be done shows with the lists
-        from copem_replay.errors import ExperimentError
-        from copem_replay.exact import check_exact
-        from copem_replay.replay import prepare
+    from copem_replay.run import notes_of
 
-        try:
-            check_exact([prepare(recording, wanted) for recording in recordings], wanted)
-        except ExperimentError as error:
-            raise InputError([source.at(("measure", "exact"), problem) for problem in error.problems]) from None
+    prepared, warnings = _prepared(source, wanted, recordings)
+    notes = notes_of(recordings, prepared, wanted, replayed=False) + warnings
+    _complain(f"note: {note}" for note in notes)
     print(_printable(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in recordings)}"))
     return 0
 
@@ -159,7 +155,11 @@ def run(
     url = _viewer(ready, viewer) if live or viewer is not None else None
     from copem_replay.run import run as run_experiment
 
-    result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
+    prepared, warnings = _prepared(source, ready, recordings)
+    _complain(f"note: {warning}" for warning in warnings)
+    result = _with_progress(
+        lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress, ready=prepared)
+    )
     notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite, viewer=url)
     _complain([f"note: {path}: skipped: {reason}" for path, reason in skipped] + [f"note: {note}" for note in notes])
     print(summary_text(result.summary))
@@ -340,6 +340,23 @@ def _ready(source: Any, *, skip_unreadable: bool) -> tuple[Any, Any, list[tuple[
     if found:
         raise InputError(found)
     return experiment, recordings, [(log.path, log.reason) for log in refused]
+
+
+def _prepared(source: Any, experiment: Any, recordings: Any) -> tuple[Any, list[str]]:
+    """The logs made ready, and what is to be said before any run; raises with what cannot be done with them."""
+    from copem_replay.errors import ExperimentError
+    from copem_replay.memory import memory_notes
+    from copem_replay.replay import prepare
+    from copem_replay.run import check_closed_form
+
+    prepared = [prepare(recording, experiment) for recording in recordings]
+    key: tuple[str, ...] = ("measure", "exact")
+    try:
+        check_closed_form(prepared, experiment)
+        key = ("runs",)
+        return prepared, memory_notes(prepared, experiment)
+    except ExperimentError as error:
+        raise InputError([source.at(key, problem) for problem in error.problems]) from None
 
 
 def _viewer(experiment: Any, url: str | None) -> str:

@@ -169,8 +169,7 @@ _DEVIATIONS = ("sigma_m", "sigma", "std_m", "std", "stddev_m", "stddev")
 
 def _variances(sigma_m: object) -> str:
     """How a covariance is written that was given as a standard deviation."""
-    is_number = isinstance(sigma_m, int | float) and not isinstance(sigma_m, bool)
-    variance = f"{sigma_m**2:g}" if is_number else "σ²"
+    variance = f"{sigma_m**2:g}" if isinstance(sigma_m, int | float) else "σ²"
     return f"`covariance_m2: [[{variance}, 0], [0, {variance}]]`"
 
 
@@ -234,6 +233,16 @@ def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
             paths |= dict.fromkeys(found, ("logs", k))
             problems += [] if found else [source.at(("logs", k), f"no file matches {pattern!r}")]
     return paths, problems
+
+
+def named_paths(source: Source) -> Iterator[tuple[str, Path]]:
+    """Each recording as often as it is named, and by what: `logs[0]`, `--log`."""
+    for pattern in source.logs:
+        yield from (("--log", path) for path in matching(pattern, Path()))
+    named = source.data.get("logs")
+    for k, pattern in enumerate(named if isinstance(named, list) and not source.logs else []):
+        if isinstance(pattern, str):
+            yield from ((f"logs[{k}]", path) for path in matching(pattern, source.path.parent))
 
 
 def matching(pattern: str, folder: Path) -> list[Path]:

@@ -452,7 +452,7 @@ class TestRun:
 
     def test_log_that_is_not_utf8(self, here: Path, call: Call) -> None:
         drive(here / "caf\udce9.mcap")
-        for arguments in (["--log", "caf\udce9.mcap"], ["--log", "*.mcap", "--skip-unreadable", "--log", "drive.mcap"]):
+        for arguments in (["--log", "caf\udce9.mcap"], ["--log", "*.mcap", "--skip-unreadable"]):
             ended = call("run", "e.yaml", *arguments)
             assert r"caf\udce9.mcap: " in ended.lines[0]
             assert len(ended.lines) == 1
