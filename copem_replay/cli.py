@@ -6,21 +6,26 @@
 
 from __future__ import annotations
 
-import gc
-import io
-import os
-import signal
 import sys
-import traceback
-import unicodedata
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from pathlib import Path
-from typing import Annotated, Any
 
-import typer
+try:  # before `main` is there to catch it
+    import gc
+    import io
+    import os
+    import signal
+    import traceback
+    import unicodedata
+    from collections.abc import Callable, Iterable, Sequence
+    from contextlib import suppress
+    from pathlib import Path
+    from typing import Annotated, Any
 
-from copem_replay.errors import CopemError, InputError, OutputError
+    import typer
+
+    from copem_replay.errors import CopemError, InputError, OutputError
+except KeyboardInterrupt:
+    print("interrupted", file=sys.stderr)
+    sys.exit(130)
 
 app = typer.Typer(
     help="Replay recorded traffic through perception error models of one or many cooperating units.",
