@@ -5,7 +5,7 @@ Nothing here depends on the run, on a model's parameters or on a configuration: 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from copem_replay.pem.condition import applies
 from copem_replay.pem.detection import probability_of
 from copem_replay.pem.look import Look
 from copem_replay.resample import AROUND_S, at_instants, wrap
+from copem_replay.stretches import Stretch
 from copem_replay.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
 from copem_replay.units import Placed, Poses, observers, place
 from copem_replay.visibility import visible_shares
@@ -87,15 +88,8 @@ def candidates(
     """
     if placed is None:
         placed = place(scene, truth, experiment)
-    together: dict[bytes, list[str]] = {}
-    for name, stamps in placed.stamps_ns.items():
-        together.setdefault(stamps.tobytes(), []).append(name)
     pieces: dict[str, tuple[Tracks, Look]] = {}
-    for names in together.values():
-        own_rate = experiment.units[names[0]].rate_hz is not None
-        world = truth.captured_between(from_s, until_s)
-        if own_rate:
-            world = _world(scene, truth, placed.stamps_ns[names[0]], experiment.max_gap_s, from_s, until_s)
+    for names, world in _worlds(scene, truth, experiment, placed, from_s, until_s):
         places = [placed.poses[name] for name in names]
         carriers = np.array([placed.carrier_ix[name] for name in names])
         flat = experiment.visibility == "flat"
@@ -112,6 +106,42 @@ def candidates(
     )
     look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
     return Candidates(tracks, look, *_assess(tracks, look, experiment))
+
+
+def could_meet(scene: Scene, truth: Tracks, experiment: Experiment, placed: Placed, cut: Sequence[Stretch]) -> Bool:
+    """(U,) whether an object ever has range, azimuth and class of a condition of each unit's PEM, seen or hidden.
+
+    Without a look at who hides whom: what is never met here, no replay meets. `cut`: the stretches of the log.
+    """
+    met = dict.fromkeys(experiment.modelled, False)
+    for stretch in cut:
+        for names, world in _worlds(scene, truth, experiment, placed, stretch.from_s, stretch.until_s):
+            for name in names:
+                if met[name]:
+                    continue
+                whole = np.ones(len(world.frame_ix))
+                tracks, look = _from_unit(world, placed.poses[name], placed.carrier_ix[name], whole)
+                look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
+                pem = experiment.pems[str(experiment.units[name].pem)]
+                anyhow = (couple.when.model_copy(update={"visible_share": None}) for couple in pem)
+                met[name] = any(bool(condition.holds(look).any()) for condition in anyhow)
+        if all(met.values()):
+            break
+    return np.array(list(met.values()), dtype=bool)
+
+
+def _worlds(
+    scene: Scene, truth: Tracks, experiment: Experiment, placed: Placed, from_s: float, until_s: float
+) -> Iterator[tuple[list[str], Tracks]]:
+    """The world at the lists of the units, once for all units that have theirs at the same instants."""
+    together: dict[bytes, list[str]] = {}
+    for name, stamps in placed.stamps_ns.items():
+        together.setdefault(stamps.tobytes(), []).append(name)
+    for names in together.values():
+        if experiment.units[names[0]].rate_hz is None:
+            yield names, truth.captured_between(from_s, until_s)
+        else:
+            yield names, _world(scene, truth, placed.stamps_ns[names[0]], experiment.max_gap_s, from_s, until_s)
 
 
 def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float, from_s: float, until_s: float) -> Tracks:

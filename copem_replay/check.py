@@ -11,7 +11,7 @@ from pathlib import Path
 from copem_replay.container import name_of
 from copem_replay.errors import EmptyWindowError, RecordingError
 from copem_replay.experiment import Carriers, Experiment, ReadFields
-from copem_replay.experiment_file import Source, is_there, log_paths, parse
+from copem_replay.experiment_file import Source, is_there, log_paths, named_paths, parse
 from copem_replay.plain_yaml import Key
 from copem_replay.read import Recording, moving_ids, read
 from copem_replay.recorded import recorded_unit
@@ -76,6 +76,7 @@ def read_logs(
     keys = paths if isinstance(paths, Mapping) else dict.fromkeys(paths)
     recordings: dict[str, Recording] = {}
     refused: list[Refused] = []
+    names_of = _named(source) if source is not None and isinstance(paths, Mapping) else {}
     for path, key in keys.items():
         if not is_there(path):
             refused.append(Refused(path, "no such file", key))
@@ -83,10 +84,21 @@ def read_logs(
             recording, wrong = _read(experiment, path)
             refused += wrong
             if recording is not None and not wrong:
-                recordings[place] = recording
+                again = names_of.get(place, [])
+                said = [f"named more than once ({', '.join(again)}): replayed once"] if len(again) > 1 else []
+                recordings[place] = replace(recording, notes=(*said, *recording.notes))
     # Named when it is known which there are: the experiment that is written with the results names only these.
     names = log_names([recording.path for recording in recordings.values()])
     return [replace(r, scene=replace(r.scene, log=n)) for r, n in zip(recordings.values(), names, strict=True)], refused
+
+
+def _named(source: Source) -> dict[str, list[str]]:
+    """By what each file is named in an experiment, or by options: `logs[0]`, `--log`."""
+    names: dict[str, list[str]] = {}
+    for name, path in named_paths(source):
+        if is_there(path):
+            names.setdefault(os.path.realpath(path), []).append(name)
+    return names
 
 
 def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Refused]]:

@@ -6,22 +6,27 @@
 
 from __future__ import annotations
 
-import gc
-import io
-import os
-import signal
 import sys
-import traceback
-import unicodedata
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from pathlib import Path
-from typing import Annotated, Any
 
-import typer
+try:  # before `main` is there to catch it
+    import gc
+    import io
+    import os
+    import signal
+    import traceback
+    import unicodedata
+    from collections.abc import Callable, Iterable, Sequence
+    from contextlib import suppress
+    from pathlib import Path
+    from typing import Annotated, Any
 
-import copem_replay
-from copem_replay.errors import CopemError, InputError, OutputError
+    import typer
+
+    import copem_replay
+    from copem_replay.errors import CopemError, InputError, OutputError
+except KeyboardInterrupt:
+    print("interrupted", file=sys.stderr)
+    sys.exit(130)
 
 app = typer.Typer(
     help="Replay recorded traffic through perception error models of one or many cooperating units.",
@@ -110,15 +115,11 @@ def check(
     """Every problem of an experiment file at once, with file and line, against its logs too."""
     source = _source(experiment, {"ego": ego}, log or [], (from_s, to_s))
     wanted, recordings, _skipped = _ready(source, skip_unreadable=False)
-    if wanted.measure.exact and wanted.measure.confirm.hits > 1:  # whether that can be done shows with the lists
-        from copem_replay.errors import ExperimentError
-        from copem_replay.exact import check_exact
-        from copem_replay.replay import prepare
+    from copem_replay.run import notes_of
 
-        try:
-            check_exact([prepare(recording, wanted) for recording in recordings], wanted)
-        except ExperimentError as error:
-            raise InputError([source.at(("measure", "exact"), problem) for problem in error.problems]) from None
+    prepared, warnings = _prepared(source, wanted, recordings)
+    notes = notes_of(recordings, prepared, wanted, replayed=False) + warnings
+    _complain(f"note: {note}" for note in notes)
     print(_printable(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in recordings)}"))
     return 0
 
@@ -162,8 +163,10 @@ def run(
         from copem_replay.run import run as run_experiment
         from copem_replay.table import summary_text
 
+        prepared, warnings = _prepared(source, ready, recordings)
+        _complain(f"note: {warning}" for warning in warnings)
         result = _with_progress(
-            lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress)
+            lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress, ready=prepared)
         )
         notes = fill_place(place, ready, recordings, result, skipped=skipped, viewer=url)
         notes = place.notes + [f"{path}: skipped: {reason}" for path, reason in skipped] + notes
@@ -360,6 +363,23 @@ def _tidied(path: Path, place: Path | None = None) -> None:
     from copem_replay.scratch import remove_leftovers
 
     _complain(f"note: {note}" for note in remove_leftovers(path, place))
+
+
+def _prepared(source: Any, experiment: Any, recordings: Any) -> tuple[Any, list[str]]:
+    """The logs made ready, and what is to be said before any run; raises with what cannot be done with them."""
+    from copem_replay.errors import ExperimentError
+    from copem_replay.memory import memory_notes
+    from copem_replay.replay import prepare
+    from copem_replay.run import check_closed_form
+
+    prepared = [prepare(recording, experiment) for recording in recordings]
+    key: tuple[str, ...] = ("measure", "exact")
+    try:
+        check_closed_form(prepared, experiment)
+        key = ("runs",)
+        return prepared, memory_notes(prepared, experiment)
+    except ExperimentError as error:
+        raise InputError([source.at(key, problem) for problem in error.problems]) from None
 
 
 def _viewer(experiment: Any, url: str | None) -> str:

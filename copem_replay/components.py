@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import traceback
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from importlib.metadata import entry_points
@@ -22,11 +21,13 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    ValidationError,
     WithJsonSchema,
 )
 from pydantic_core import PydanticCustomError, core_schema
 
 from copem_replay.errors import InputError
+from copem_replay.own_code import FAILURES, failed, is_own, written_at
 
 T = TypeVar("T")
 
@@ -43,16 +44,29 @@ class Component(Frozen):
     kind: str
 
 
+class GivenError(TypeError):
+    """A method of a component gave something else than it should: which one, and what."""
+
+    def __init__(self, method: str, message: str) -> None:
+        super().__init__(f"{method}: {message}")
+        self.method = method
+
+
 def asked(component: Component, where: str, work: Callable[[], T]) -> T:
     """What a component answers. Raises InputError where a user's own one fails; a failure of ours stays a defect."""
     try:
         return work()
-    except Exception as error:
-        if type(component).__module__.startswith("copem_replay."):
+    except FAILURES as error:
+        if not is_own(type(component)):
             raise
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        why = " ".join(f"{type(error).__name__}: {error}".split())
-        raise InputError(f"{where}: {component.kind}: {why} ({place.filename}:{place.lineno})") from error
+        if isinstance(error, GivenError):
+            raise wrong(component, where, str(error), error.method) from error
+        raise InputError(f"{where}: {component.kind}: {failed(error, type(component))}") from error
+
+
+def wrong(component: Component, where: str, message: str, *methods: str) -> InputError:
+    """The error that what a component gave is wrong, with file and line of the first of these methods that is own."""
+    return InputError(f"{where}: {component.kind}: {message}{written_at(type(component), *methods)}")
 
 
 _LARGEST = 1e12
@@ -136,11 +150,10 @@ class Slot:
         module, _, name = target.partition(":")
         try:
             component = getattr(importlib.import_module(module), name)
-        except Exception as error:  # whatever a module of the user's raises
-            why = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            raise _problem(
-                f"kind: {kind!r} cannot be imported: {why} (install it, or name its folder in PYTHONPATH)"
-            ) from error
+        except FAILURES as error:  # whatever a module of the user's raises
+            away = isinstance(error, ModuleNotFoundError) and module.startswith(str(error.name))
+            hint = " (install it, or name its folder in PYTHONPATH)" if away else ""
+            raise _problem(f"kind: {kind!r} cannot be imported: {failed(error)}{hint}") from error
         if not (isinstance(component, type) and issubclass(component, self.base)) or component is self.base:
             raise _problem(
                 f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}; derive it from that"
@@ -159,7 +172,15 @@ class Slot:
         if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
             found = "nothing" if value is None else repr(value)
             raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {found}")
-        return self.find(value["kind"]).model_validate(dict(value))
+        component = self.find(value["kind"])
+        try:
+            return component.model_validate(dict(value))
+        except ValidationError:
+            raise
+        except FAILURES as error:  # of a constructor of the user's
+            if not is_own(component):
+                raise
+            raise _problem(f"kind: {value['kind']!r} cannot be made: {failed(error, component)}") from error
 
 
 def _problem(message: str) -> PydanticCustomError:

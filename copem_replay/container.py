@@ -7,6 +7,7 @@ fails) is read from start to end, as far as it goes.
 
 from __future__ import annotations
 
+import io
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Set
@@ -40,6 +41,10 @@ class Channel:
     expected: int | None = None  # of a damaged file: how many its index promises, where that is known
     schema_encoding: str = ""
     schema_data: bytes = field(default=b"", repr=False)
+
+
+_READ_AT_ONCE = 1 << 16
+"""Bytes (chosen: a call of Python's for as many takes no time beside reading them)."""
 
 
 class BrokenIndexError(Exception):
@@ -118,10 +123,26 @@ class Log:
             raise BrokenIndexError(self.path) from without_trace(error)
 
 
+class _File(io.FileIO):
+    """A file whose disk or network may fail: that is no damage of what is in it, and is said of it."""
+
+    def readinto(self, buffer: Any) -> int:
+        try:
+            return super().readinto(buffer)
+        except OSError as error:
+            raise RecordingError(f"{self.name}: cannot be read: {error.strerror}") from None
+
+    def readall(self) -> bytes:
+        try:
+            return super().readall()
+        except OSError as error:
+            raise RecordingError(f"{self.name}: cannot be read: {error.strerror}") from None
+
+
 def open_file(path: Path) -> IO[bytes]:
-    """Open a file to be read. Raises RecordingError."""
+    """Open a file to be read. Raises RecordingError, also later when it cannot be read."""
     try:
-        return path.open("rb")
+        return io.BufferedReader(_File(str(path)), _READ_AT_ONCE)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be opened: {error.strerror}") from None
 

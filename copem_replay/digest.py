@@ -6,15 +6,16 @@ import hashlib
 from pathlib import Path
 
 from copem_replay.bag_metadata import files_of
+from copem_replay.container import open_file
 
 
 def sha256_of(path: Path) -> str:
     """Of a file; of a folder of rosbag2, of its files one after the other, as `cat` has them.
 
-    Raises OSError, and RecordingError where the folder is none of rosbag2.
+    Raises RecordingError: it cannot be read, or the folder is none of rosbag2.
     """
     digest = hashlib.sha256()
     for place in files_of(path) if path.is_dir() else [path]:
-        with place.open("rb") as file:
-            hashlib.file_digest(file, lambda: digest)
+        with open_file(place) as file:
+            hashlib.file_digest(file, lambda: digest)  # type: ignore[arg-type]  # it has `readinto`
     return digest.hexdigest()

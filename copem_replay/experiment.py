@@ -26,6 +26,12 @@ def _unit_name(value: str) -> str:
     return value
 
 
+def _of_64_bits(value: int) -> int:
+    if not -(2**63) <= value < 2**64:
+        raise ValueError(f"expected a whole number of 64 bits (-2^63 … 2^64 - 1), found {value}")
+    return value
+
+
 def _version(value: object) -> object:
     if isinstance(value, bool):  # equals 1 to Python
         raise ValueError(f"expected 1, found {str(value).lower()}")
@@ -42,6 +48,19 @@ def _configuration_name(value: str) -> str:
 UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 Point = tuple[Number, Number]
+
+
+def _two(value: object) -> object:
+    if isinstance(value, list | tuple) and len(value) == 3:
+        found = ", ".join(str(number) for number in value)
+        raise ValueError(f"expected two numbers, in the plane, found [{found}]; the height above ground is `height_m`")
+    return value
+
+
+InPlane = Annotated[Point, BeforeValidator(_two)]
+"""A point beside which a height may stand."""
+
+
 Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
 """Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 
@@ -85,8 +104,8 @@ class Unit(Frozen):
     """
 
     on: On | None = None
-    at: Point | None = None
-    offset_m: Point = (0.0, 0.0)
+    at: InPlane | None = None
+    offset_m: InPlane = (0.0, 0.0)
     yaw_deg: Number = 0.0
     height_m: NotNegative | None = None
     ground_z_m: Number | None = None
@@ -114,6 +133,17 @@ class Unit(Frozen):
         return self
 
 
+_AROUND = "the corners in order around an area, each once"
+
+
+def _crooked(reason: str) -> str:
+    """What is wrong with a polygon, of which shapely says `Self-intersection[5 5]`."""
+    what, _, place = reason.rstrip("]").partition("[")
+    at = f" at [{', '.join(place.split())}]" if place else ""
+    words = {"Self-intersection": f"edges that cross or overlap{at}", "Ring Self-intersection": f"edges that meet{at}"}
+    return words.get(what, "corners without an area between them")
+
+
 class Obstacle(Frozen):
     """A static obstacle beside those in the log."""
 
@@ -127,7 +157,7 @@ class Obstacle(Frozen):
 
         polygon = shapely.Polygon(self.polygon_m)
         if not polygon.is_valid or polygon.area <= 0:
-            raise ValueError(f"polygon_m: expected a simple polygon, found {shapely.is_valid_reason(polygon)}")
+            raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
         return self
 
 
@@ -159,7 +189,13 @@ class Braking(Frozen):
     brakes_for: Literal["object", "conflict"] = "object"
 
 
-Units = Annotated[int, Field(strict=True, ge=0, le=10**6)]
+def _how_many(value: object) -> object:
+    if isinstance(value, str | list | tuple):
+        raise ValueError(f"expected how many units beside the ego's, such as 2 (a count, no names), found {value!r}")
+    return value
+
+
+Units = Annotated[int, Field(strict=True, ge=0, le=10**6), BeforeValidator(_how_many)]
 
 
 def _once(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -276,7 +312,7 @@ class Experiment(Frozen):
     window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1
-    seed: Annotated[int, Field(strict=True)] = 0
+    seed: Annotated[int, Field(strict=True), AfterValidator(_of_64_bits)] = 0
     pems: dict[Id, Pem] = Field(default_factory=dict)
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()

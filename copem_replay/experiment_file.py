@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
-from copem_replay.plain_yaml import Key, NotYamlError, read
+from copem_replay.plain_yaml import AliasesError, Key, NotYamlError, read
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,8 @@ def load(path: Path) -> Source:
         raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
     try:
         data, lines, problems = read(text)
+    except AliasesError as error:
+        raise ExperimentError(f"{path}:{error.line}: {error.why}") from None
     except NotYamlError as error:
         raise ExperimentError(f"{path}:{error.line}: not YAML: {error.why}") from None
     if not isinstance(data, dict):
@@ -148,6 +150,8 @@ def _message(items: Sequence[Any], key: Key, data: Any) -> str:
         known = _names_at(key[:-1], data)
         near = difflib.get_close_matches(str(key[-1]), known, n=1)
         hint = f"did you mean {near[0]}?{_unit(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
+        if key[-1] in _DEVIATIONS and "covariance_m2" in known:
+            hint = f"{_variances(first['input'])} says it"
         return "unknown key" + (f"; {hint}" if known else "")
     if first["type"] == "missing":
         return "missing"
@@ -157,7 +161,24 @@ def _message(items: Sequence[Any], key: Key, data: Any) -> str:
         return "expected at least one, found none"
     words = dict.fromkeys(_EXPECTED[item["type"]].format(**item.get("ctx", {})) for item in items)
     found = first["ctx"]["tag"] if first["type"] == "union_tag_invalid" else first["input"]
-    return f"expected {', or '.join(words)}, found {_short(found)}"
+    return f"expected {', or '.join(words)}, found {_short(found)}{_percent(first)}"
+
+
+_DEVIATIONS = ("sigma_m", "sigma", "std_m", "std", "stddev_m", "stddev")
+
+
+def _variances(sigma_m: object) -> str:
+    """How a covariance is written that was given as a standard deviation."""
+    variance = f"{sigma_m**2:g}" if isinstance(sigma_m, int | float) else "σ²"
+    return f"`covariance_m2: [[{variance}, 0], [0, {variance}]]`"
+
+
+def _percent(item: Any) -> str:
+    """How a fraction is written that seems to have been given in per cent."""
+    is_share = item["type"] == "less_than_equal" and item["ctx"]["le"] == 1
+    if not is_share or not 2 < item["input"] <= 100:  # 1.5 and 2 are other mistakes (chosen)
+        return ""
+    return f"; a fraction: {item['input']:g} % is {item['input'] / 100:g}"
 
 
 def _names_at(key: Key, data: Any) -> list[str]:
@@ -212,6 +233,16 @@ def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
             paths |= dict.fromkeys(found, ("logs", k))
             problems += [] if found else [source.at(("logs", k), f"no file matches {pattern!r}")]
     return paths, problems
+
+
+def named_paths(source: Source) -> Iterator[tuple[str, Path]]:
+    """Each recording as often as it is named, and by what: `logs[0]`, `--log`."""
+    for pattern in source.logs:
+        yield from (("--log", path) for path in matching(pattern, Path()))
+    named = source.data.get("logs")
+    for k, pattern in enumerate(named if isinstance(named, list) and not source.logs else []):
+        if isinstance(pattern, str):
+            yield from ((f"logs[{k}]", path) for path in matching(pattern, source.path.parent))
 
 
 def matching(pattern: str, folder: Path) -> list[Path]:

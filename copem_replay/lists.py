@@ -116,11 +116,22 @@ def _all_rows(path: Path, topic: str, window: Window | None = None) -> tuple[_Ro
         return _read(log.from_start(error), topic)
 
 
+def _no_lists(log: container.Log, topic: str) -> str:
+    """That a topic holds no lists of a unit, and which ones do."""
+    from copem_replay.topics import known_lists
+
+    there = {c.topic for c in log.channels if c.schema == sensor_data.SCHEMA} | {c.topic for c in known_lists(log)}
+    schemas = sorted({c.schema or "no schema" for c in log.channels if c.topic == topic})
+    found = f"topic {topic!r} holds {', '.join(schemas)}" if schemas else f"no topic {topic!r}"
+    if not there:
+        return f"{found}; no topic of this log holds lists of a unit"
+    return f"{found}; lists of units are on {', '.join(sorted(there))}"
+
+
 def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == sensor_data.SCHEMA}
     if not chosen:
-        there = sorted(c.topic for c in log.channels if c.schema == sensor_data.SCHEMA)
-        raise RecordingError(f"{log.path}: no {sensor_data.SCHEMA} on topic {topic!r}; it is on {there or 'none'}")
+        raise RecordingError(f"{log.path}: {_no_lists(log, topic)}")
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == detail.SCHEMA}
     rows = _Rows()

@@ -12,6 +12,11 @@ CONVERT = "`ros2 bag convert` makes MCAP of it (`storage_id: mcap` in its output
 _UNPACKED_BY = {".xz": "xz", ".lzma": "xz", ".zst": "zstd", ".zstd": "zstd", ".gz": "gzip", ".bz2": "bzip2"}
 _LFS_POINTER = b"version https://git-lfs"
 _LOOKED_AT = 64
+_SHOWN_BYTES = 16
+_CONVERTED = (".csv", ".tsv", ".json", ".xml")
+_MADE = "; docs/converters.md says what makes a recording of such files"
+_ROS1 = b"#ROSBAG"
+_NEWER = "`rosbags-convert --src FILE --dst FOLDER --dst-storage mcap` makes a folder of it that is"
 _SQLITE = b"SQLite format 3\0"
 
 
@@ -41,10 +46,27 @@ def _what(expected: str, path: Path, start: bytes) -> str:
         return "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
     if start.startswith(_SQLITE):
         return f"a SQLite file, which is not read; of a rosbag2 folder, {CONVERT}"
+    if start.startswith(_ROS1):
+        return f"a bag of ROS 1, which is not read; {_NEWER}"
     if how := unpacking(path):
         return how
     if path.suffix.lower() in (".txt", ".txth"):
         return "text, which is not read; OSI traces are read as .osi (messages in binary) or .mcap"
     if path.name == "metadata.yaml":
         return "the description of a rosbag2 folder; give the folder it is in"
-    return f"expected {expected}, found one that starts with {start[:16]!r}"
+    return f"expected {expected}, found {_content(path, start)}"
+
+
+def _content(path: Path, start: bytes) -> str:
+    """What a file begins with that nothing is known of: its first words, or its first bytes."""
+    try:
+        text = start.decode("utf-8", errors="ignore" if len(start) == _LOOKED_AT else "strict")
+    except UnicodeDecodeError:
+        text = ""
+    line = text.strip().partition("\n")[0].strip()
+    whole = len(text.encode()) > len(start) - 4  # of what is cut off within a character
+    if not line or not whole or not all(c.isprintable() or c in "\t\r\n" for c in text):
+        return f"a file whose first bytes are {start[:_SHOWN_BYTES].hex(' ')}"
+    if path.suffix.lower() in (".csv", ".tsv"):
+        return f"a table with the columns {line}{_MADE}"
+    return f"text that begins with {line!r}{_MADE if path.suffix.lower() in _CONVERTED else ''}"

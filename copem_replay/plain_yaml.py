@@ -27,10 +27,14 @@ class NotYamlError(Exception):
         self.line, self.why = line, why
 
 
+class AliasesError(NotYamlError):
+    """A text is YAML, and its aliases stand for more than any use has."""
+
+
 def read(text: str) -> tuple[Any, dict[Key, int], list[tuple[Key, int, str]]]:
     """Plain data, the line of each key, and problems that leave the rest readable (key, line, message).
 
-    Raises NotYamlError.
+    Raises NotYamlError, AliasesError.
     """
     root = composed(text)
     if root is None:
@@ -87,6 +91,10 @@ def _core(text: str) -> Any:
     return text
 
 
+_REPEATED = 200_000
+"""Characters and values that aliases of one text may stand for (chosen: hundreds of PEMs written out again)."""
+
+
 @dataclass
 class _Reading:
     """Nodes into plain data: where each key stands, and what is wrong on the way."""
@@ -94,9 +102,20 @@ class _Reading:
     lines: dict[Key, int] = field(default_factory=lambda: {(): 1})
     problems: list[tuple[Key, int, str]] = field(default_factory=list)
     within: list[Node] = field(default_factory=list)
+    seen: set[int] = field(default_factory=set)  # nodes, which live as long as their root
+    repeated: int = 0
 
     def plain(self, node: Node, key: Key) -> Any:
-        """A node as plain data."""
+        """A node as plain data. Raises AliasesError."""
+        if id(node) in self.seen:  # by way of an alias, of it or of what it is in
+            self.repeated += 1 + (len(node.value) if isinstance(node, ScalarNode) else 0)
+            if self.repeated > _REPEATED:
+                raise AliasesError(
+                    node.start_mark.line + 1,
+                    f"expected aliases that stand for at most {_REPEATED} characters and values in all, found more "
+                    "(what stands here is repeated most lately); take fewer aliases of aliases",
+                )
+        self.seen.add(id(node))
         if isinstance(node, ScalarNode):
             return self._scalar(node, key)
         if any(node is outer for outer in self.within):

@@ -19,6 +19,7 @@ import pandas as pd
 from copem_replay.accuracy_tables import AccuracyTables
 from copem_replay.belongings import MARK
 from copem_replay.check import place_of
+from copem_replay.csv_names import for_spreadsheets
 from copem_replay.digest import sha256_of
 from copem_replay.errors import OutputError
 from copem_replay.experiment import Experiment
@@ -224,5 +225,5 @@ def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:
-    """A table as CSV: nulls empty, numbers with nine significant digits."""
-    table.to_csv(path, index=False, float_format="%.9g", lineterminator="\n")
+    """A table as CSV: nulls empty, numbers with nine significant digits, names quoted for spreadsheets."""
+    for_spreadsheets(table).to_csv(path, index=False, float_format="%.9g", lineterminator="\n")

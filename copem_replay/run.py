@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from copem_replay import replay as replays
 from copem_replay.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
 from copem_replay.exact import check_exact, exact_table
-from copem_replay.experiment import Carriers, Experiment
-from copem_replay.measure_keys import At
-from copem_replay.onset import measured_objects
+from copem_replay.experiment import Experiment
+from copem_replay.memory import memory_notes
+from copem_replay.oddities import oddities
 from copem_replay.read import Recording
 from copem_replay.replay import Outcome, Replay
 from copem_replay.summary import horizon_s, summary
 from copem_replay.sweep import Point, points, without_points
-from copem_replay.tracks import CLASSES, TRUTH
 
 Progress = Callable[[int, int], None]
 """`progress(done, total)`, called after each block of runs."""
@@ -42,15 +41,23 @@ class Result:
 
 
 def run(
-    experiment: Experiment, recordings: Sequence[Recording], *, jobs: int = 1, progress: Progress | None = None
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    *,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    ready: Sequence[Replay] | None = None,
 ) -> Result:
-    """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks."""
-    ready = [replays.prepare(recording, experiment) for recording in recordings]
-    # Before the runs: what has no closed form is refused at once.
+    """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks.
+
+    `ready`: the logs as they were prepared and checked before. Raises ExperimentError before any run: something that
+    has no closed form, runs that no memory holds.
+    """
+    if ready is None:
+        ready = [replays.prepare(recording, experiment) for recording in recordings]
+        check_closed_form(ready, experiment)
+        memory_notes(ready, experiment)
     exact = _exactly(ready, experiment)
-    for point in points(experiment):
-        if point.same_units:
-            check_exact(ready, point.experiment)
     tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)))
     table, parts, order = tables.of(ready, experiment)
     horizon = horizon_s(table, experiment.measure.horizon_s)
@@ -64,17 +71,39 @@ def run(
         accuracy=totals(parts),
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
-    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
-    notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
-    notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
+    notes = notes_of(recordings, ready, experiment, replayed=True)
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):
-        same_units = all((replay.fleet.share == 1).all() for replay in ready)
-        accuracy = accuracy_tables(parts, order, same_units=same_units)
-        if not same_units:
-            notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+        accuracy = accuracy_tables(parts, order, same_units=_same_units(ready))
     return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
+
+
+def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
+    """Raises ExperimentError where exact times are asked for, also along a sweep, and there are none."""
+    check_exact(ready, experiment)
+    for point in points(experiment):
+        if point.same_units:
+            check_exact(ready, point.experiment)
+
+
+def notes_of(
+    recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
+) -> list[str]:
+    """What has to be said of the recordings, and of them and the experiment together: after a replay, or before."""
+    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
+    for replay in ready:
+        met = replay.ever_met if replayed else None
+        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
+    notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
+    if experiment.measure.accuracy and not _same_units(ready):
+        notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+    return notes
+
+
+def _same_units(ready: Sequence[Replay]) -> bool:
+    """Whether all runs have the same units."""
+    return all(bool((replay.fleet.share == 1).all()) for replay in ready)
 
 
 def _at_point(
@@ -147,43 +176,6 @@ def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float |
 def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:
     count, span_s = sum(n for n, _ in intervals), sum(s for _, s in intervals)
     return count / span_s if span_s > 0 else None
-
-
-def _notes(replay: Replay, experiment: Experiment) -> list[str]:
-    """What is odd about a log and an experiment together."""
-    notes = list(replay.placed.notes)
-    for (name, unit), ever_met in zip(replay.fleet.experiment.modelled.items(), replay.ever_met, strict=True):
-        if not replay.placed.poses[name].present.any():
-            notes.append(f"unit {name}: makes no list, its carrier is never there")
-        elif not ever_met:
-            notes.append(f"unit {name}: no object ever meets a condition of its PEM {unit.pem!r}")
-    scene, measure = replay.scene, experiment.measure
-    if not len(measured_objects(scene, measure)):
-        others = np.arange(len(scene.object_class)) != scene.ego_ix
-        there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["nobody"]
-        wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
-        beside = " beside the ego" if scene.ego_ix >= 0 else ""
-        notes.append(f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}")
-    elif isinstance(measure.onset, At) and measure.onset.time_s > scene.end_s:
-        notes.append(f"no rows: the onset at {measure.onset.time_s:g} s lies after the log's end, {scene.end_s:g} s")
-    elif not len(replay.looks.object_ix):
-        notes.append(f"no rows: no measured object has an onset ({measure.onset.kind})")
-    if experiment.braking is not None and len(replay.looks.object_ix) and not replay.encounters:
-        how = "as recorded" if experiment.braking.ego == "recorded" else "at constant speed"
-        notes.append(
-            f"no verdict: the ego, not braking ({how}), stays more than {experiment.braking.margin_m:g} m from all "
-            "that is measured"
-            + ("; `ego: constant_speed` asks what if nobody had braked" if how == "as recorded" else "")
-        )
-    for name, unit in experiment.units.items():
-        if isinstance(unit.on, Carriers) and name not in replay.fleet.named:
-            notes.append(f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})")
-    for name, configuration in experiment.configurations.items():
-        units = experiment.units_of(configuration) or (TRUTH,)
-        late = [unit for unit in units if configuration.latency_of(unit) > scene.end_s]
-        if late:
-            notes.append(f"configuration {name}: the latency of {', '.join(late)} is longer than the log")
-    return notes
 
 
 def log_path_of(recordings: Sequence[Recording], log: str) -> Path:

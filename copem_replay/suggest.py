@@ -23,6 +23,7 @@ MAST_M = 10.0
 """So far from the busiest place the mast stands (chosen: beside the lane, not on it)."""
 _CELL_M = 10.0  # the busiest place is sought on a grid (chosen)
 _MOVED_M = 10.0  # who came less far is parked or a pedestrian's width away from it (chosen)
+_MOSTLY = 0.75  # the share of a log that an ego is there (chosen: what records a log is there from beginning to end)
 _ROWS = 100_000  # object states looked at for a place of the mast (chosen: a sample says it as well)
 _DRIVEN = ("car", "van", "truck", "bus", "vehicle", "motorcycle")
 _FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle")  # as drivers name the vehicle's own
@@ -108,7 +109,10 @@ def _poses(log: Log) -> list[dict[str, str]]:
 
 
 def _longest(scene: Scene, truth: Tracks) -> tuple[str, str]:
-    """The vehicle that is there longest of those that drive, and why; "none" where nobody else would be measured."""
+    """The vehicle that is there longest of those that drive, and why; "none" where nothing else would be measured.
+
+    Nor is it taken where it is there for a part of the log only: what stands beside the road has recorded that.
+    """
     objects, count = truth.row_object_ix, len(scene.object_ids)
     first, last = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(first, objects, truth.row_captured_s)
@@ -126,10 +130,13 @@ def _longest(scene: Scene, truth: Tracks) -> tuple[str, str]:
     if scene.moving.sum() < 2:
         return "none", f"as the only one that moves, {scene.object_ids[int(drives.argmax())]} is measured"
     best = max(np.flatnonzero(drives), key=lambda k: (moved[k] >= _MOVED_M, last[k] - first[k], moved[k]))
-    return scene.object_ids[best], (
+    longest = (
         f"of the vehicles that drive, {scene.object_ids[best]} ({CLASSES[scene.object_class[best]]}) "
         f"is there longest, {first[best]:.1f} – {last[best]:.1f} s"
     )
+    if last[best] - first[best] < _MOSTLY * scene.end_s:
+        return "none", f"{longest} of {scene.end_s:.1f} s, and an ego is there nearly all the time"
+    return scene.object_ids[best], longest
 
 
 def _measured(scene: Scene, truth: Tracks, ego_ix: int) -> tuple[list[str] | None, str, Int]:

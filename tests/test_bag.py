@@ -299,7 +299,7 @@ def test_no_file_can_be_read(bag):
     for k in range(3):
         (bag / f"bag_{k}.mcap").write_bytes(b"x")
     assert problem(bag) == (
-        "BAG: bag_0.mcap: expected an MCAP file, found one that starts with b'x'; and so on, 3 files in all"
+        "BAG: bag_0.mcap: expected an MCAP file, found text that begins with 'x'; and so on, 3 files in all"
     )
 
 

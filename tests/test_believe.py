@@ -274,7 +274,7 @@ class TestCommand:
             ("captured_s, value: 9", "captured_s: expected captures that are not in the future"),
             ("track_id, value: 7", "track_id: expected each once in a list, found one twice (−1: no track is kept)"),
             ("unit_ix, value: 2", "unit_ix: expected −1 … 1, found 2 … 2"),
-            ("x_m, value: 13", "TypeError: step: expected a list"),
+            ("x_m, value: 13", "step: expected a list"),
         ],
     )
     def test_what_an_own_fusion_does_wrong_is_one_line(

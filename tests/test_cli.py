@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import csv
 import errno
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,6 +20,7 @@ import pytest
 from copem_replay import cli, place, plain_yaml, results, run
 from copem_replay.compare import compare, comparison_markdown, comparison_text
 from copem_replay.experiment_file import load, parse
+from copem_replay.plot import load_results
 from experiments import TEXT, changed, drive
 from recordings import Obj, truth_topic, write_mcap, write_recording
 from viewer import free_port
@@ -237,6 +240,20 @@ class TestInstalled:
             words = [sys.executable, "-c", close, stream, str(COMMAND), "run", "e.yaml", "--out", stream]
             assert subprocess.run(words, cwd=here, timeout=100).returncode == 0
 
+    @pytest.mark.parametrize("module", ["typer", "copem_replay.errors", "numpy", "pydantic", "ruamel.yaml"])
+    def test_an_interrupt_while_modules_are_imported(self, here: Path, module: str) -> None:
+        """Whenever it comes: here as a module is looked for, before `main` is there to catch it and after."""
+        (here / "sitecustomize.py").write_text(
+            "import sys\n"
+            "class Interrupts:\n"
+            "    def find_spec(self, name, path=None, target=None):\n"
+            f"        if name == {module!r}:\n"
+            "            raise KeyboardInterrupt\n"
+            "sys.meta_path.insert(0, Interrupts())\n"
+        )
+        ended = installed("check", "e.yaml", folder=here, environment={"PYTHONPATH": str(here)})
+        assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "interrupted\n")
+
 
 class TestInfo:
     def test_text(self, here: Path, call: Call) -> None:
@@ -333,6 +350,54 @@ class TestCheck:
     def test_no_experiment(self, here: Path, call: Call, name: str, said: str) -> None:
         for command in ("check", "run"):
             assert call(command, name) == (2, "", [said])
+
+    def test_what_can_hardly_be_meant_is_said_as_run_says_it(self, here: Path, call: Call) -> None:
+        (here / "e.yaml").write_text(
+            changed(
+                "logs: [drive.mcap, '*.mcap']",
+                "    - when: {range_m: [0, 80], azimuth_deg: [-0.001, 0.001]}",
+                "  mast: {at: [12.0, 450000.0], ground_z_m: 0, height_m: 5.0, pem: onboard}",
+                "  coPEM: {units: all, latency_s: 250}",
+            )
+        )
+        checked, run = call("check", "e.yaml"), call("run", "e.yaml")
+        assert (checked.code, run.code) == (0, 0)
+        assert checked.out == "e.yaml: no problem found; logs: drive\n"
+        assert checked.lines == run.lines
+        assert [line.partition(":")[0] for line in checked.lines] == ["note"] * 4
+        for part in ("logs[0], logs[1]", "450 km away", "unit mast: no object ever meets", "longer than the log"):
+            assert any(part in line for line in checked.lines), part
+
+    @pytest.mark.parametrize("command", ["check", "run"])
+    def test_runs_that_no_memory_holds(self, here: Path, call: Call, command: str) -> None:
+        (here / "e.yaml").write_text(changed("runs: 1000000000"))
+        ended = call(command, "e.yaml")
+        assert (ended.code, ended.out) == (2, "")
+        (line,) = ended.lines
+        least = r"1000000000 runs of 3 rows each take at least 1\.2e\+03 GB"
+        assert re.fullmatch(rf"e\.yaml:3: runs: {least}, and .* GB are free; take \d+ or fewer", line)
+        assert not (here / "out").exists()
+
+    def test_runs_that_may_be_too_many_are_said_before(
+        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("copem_replay.memory.free_bytes", lambda: 50_000)
+        monkeypatch.setattr(run.replays, "outcomes", raising(OSError(5, "Input/output error")))
+        said = "note: 4 runs of 3 rows each may take 6e-05 GB, and 5e-05 GB are free"
+        assert call("check", "e.yaml").lines == [said]
+        assert call("run", "e.yaml").lines == [said, "copem-replay: Input/output error"]
+
+    @pytest.mark.skipif(not Path("/proc/self/mem").is_file(), reason="no file here whose reading fails")
+    def test_a_file_that_cannot_be_read_is_named_among_the_others(self, here: Path, call: Call) -> None:
+        failing = "/proc/self/mem: cannot be read: Input/output error"
+        for command in (["check"], ["run", "--seed", "1"]):
+            ended = call(*command, "e.yaml", "--log", "/proc/self/mem", "--log", "none.mcap")
+            assert ended == (2, "", [failing, "none.mcap: no such file"])
+        assert call("info", "/proc/self/mem").lines == [failing]
+        assert call("init", "/proc/self/mem").lines == [failing]
+        skipped = call("run", "e.yaml", "--log", "/proc/self/mem", "--log", "drive.mcap", "--skip-unreadable")
+        assert skipped.code == 1
+        assert skipped.lines == ["note: " + failing.replace(": cannot", ": skipped: cannot")]
 
     def test_from_another_folder(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         (here / "sub").mkdir()
@@ -452,7 +517,7 @@ class TestRun:
 
     def test_log_that_is_not_utf8(self, here: Path, call: Call) -> None:
         drive(here / "caf\udce9.mcap")
-        for arguments in (["--log", "caf\udce9.mcap"], ["--log", "*.mcap", "--skip-unreadable", "--log", "drive.mcap"]):
+        for arguments in (["--log", "caf\udce9.mcap"], ["--log", "*.mcap", "--skip-unreadable"]):
             ended = call("run", "e.yaml", *arguments)
             assert r"caf\udce9.mcap: " in ended.lines[0]
             assert len(ended.lines) == 1
@@ -489,7 +554,7 @@ class TestOptions:
         assert ended.code == 2
         assert ended.lines == ["--runs: expected at most 1e+09, found 1" + "0" * 30]
 
-    @pytest.mark.parametrize("seed", ["-5", "0", "123456789012345678901234567890"])
+    @pytest.mark.parametrize("seed", ["-5", "0", "18446744073709551615"])
     def test_seed(self, here: Path, call: Call, seed: str) -> None:
         assert call("run", "e.yaml", "--runs", "50", "--out", "one").code == 0
         assert call("run", "e.yaml", "--runs", "50", "--seed", seed, "--out", "two").code == 0
@@ -537,7 +602,7 @@ class TestOptions:
         [
             ("none.mcap", "none.mcap: no such file"),
             ("x*.mcap", "--log: no file matches 'x*.mcap'"),
-            ("e.yaml", "e.yaml: expected an MCAP file, found one that starts with b'version: 1\\nlogs:'"),
+            ("e.yaml", "e.yaml: expected an MCAP file, found text that begins with 'version: 1'"),
             (".", REINDEX),
             ("", REINDEX),
             ("x" * 300, "x" * 300 + ": no such file"),
@@ -735,6 +800,46 @@ class TestCompare:
         ended = call("compare", "out/e", "other", "--baseline", "e:coPEM")
         assert (ended.code, ended.out) == (2, "")
         assert any("seed" in line for line in ended.lines)
+
+
+class TestNamesOfConfigurations:
+    """Names that spreadsheets, Markdown and HTML read as something else go through all commands as they are."""
+
+    NAMES = ("=1+1", "-x", "+y", "@SUM(A1)", "'q", "''", "<b>*_|&amp;")
+
+    @pytest.fixture
+    def odd(self, here: Path, call: Call) -> Path:
+        data = plain_yaml.read(TEXT)[0]
+        data["configurations"] = {name: {"units": ["ego"], "latency_s": 0.1 * k} for k, name in enumerate(self.NAMES)}
+        data["sweep"] = {"latency_s": [0.0, 0.5], "configurations": list(self.NAMES[:4])}
+        (here / "e.yaml").write_text(plain_yaml.dump(data))
+        assert call("run", "e.yaml").code == 0
+        return here
+
+    def test_no_cell_is_a_formula(self, odd: Path, call: Call) -> None:
+        assert call("compare", "out/e", "--baseline=-x", "--out", "c.csv").code == 0
+        for path in (odd / "out/e/summary.csv", odd / "out/e/sweep.csv", odd / "out/e/bands.csv", odd / "c.csv"):
+            with path.open(newline="") as file:
+                cells = [cell for row in csv.reader(file) for cell in row]
+            begin = [cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))]
+            assert all(math.isfinite(float(cell)) for cell in begin), path
+            assert "'=1+1" in cells, path
+
+    def test_they_are_read_as_they_were(self, odd: Path, call: Call) -> None:
+        found = load_results(odd / "out/e")
+        assert tuple(found.summary["configuration"]) == self.NAMES
+        assert found.sweep is not None
+        assert set(found.sweep["configuration"]) == {"=1+1"}, "at one latency the others are as this one"
+        for name in self.NAMES:
+            ended = call("compare", "out/e", f"--baseline={name}")
+            assert ended.code == 0
+            assert [line.split()[0] for line in ended.out.splitlines()[1:7]] == [n for n in self.NAMES if n != name]
+        assert call("report", "out/e", "--baseline==1+1").code == 0
+        page = (odd / "out/e/report.html").read_text()
+        assert "<b>*" not in page
+        assert "&lt;b&gt;*_|&amp;amp;" in page
+        ended = call("plot", "out/e", "--configurations", ",".join(self.NAMES[:5]))
+        assert (ended.code, [line for line in ended.lines if "expected" in line]) == (0, [])
 
 
 class TestTarget:
@@ -1195,7 +1300,7 @@ class TestExtremes:
             "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 0.001}",
             "  mast: {at: [0, 0], height_m: 1, pem: onboard, rate_hz: 999.9, phase_s: 1e-300}",
             "  ego: {on: ego, height_m: 1, pem: onboard, offset_m: [1e12, -1e12]}",
-            "    - when: {range_m: [0, 1e12], azimuth_deg: [-1e12, 1e12], visible_share: [1, 1]}",
+            "    - when: {range_m: [0, 1e12], azimuth_deg: [-360, 360], visible_share: [1, 1]}",
             "      error: {kind: gaussian, covariance_m2: [[1e12, 0], [0, 1e12]], mean_m: [1e12, 1e12]}",
             "      error: {kind: gaussian, covariance_m2: [[1e-300, 0], [0, 0]], yaw_sigma_deg: 1e12}",
             "      error: {kind: gaussian, covariance_m2: [[0, 0], [0, 0]], speed_sigma_mps: 1e12}",

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import csv
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
 
 from compare_folders import Row, row, write_folder
 from copem_replay.compare import (
@@ -17,6 +21,7 @@ from copem_replay.compare import (
     comparison_text,
     write_comparison,
 )
+from copem_replay.compare.tables import in_markdown
 from copem_replay.errors import InputError, OutputError
 
 
@@ -164,6 +169,47 @@ def test_markdown_has_the_same_content(tmp_path):
     notes = [f"note: {note}" for note in comparison.notes]
     assert len(notes) == 1
     assert [line.removeprefix("- ") for line in markdown[6:]] == [*text[4:], *notes]
+
+
+class Cells(HTMLParser):
+    """The text of table cells and list items."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        assert tag in ("table", "thead", "tbody", "tr", "th", "td", "ul", "li"), f"<{tag}> was made of text"
+        if tag in ("th", "td", "li"):
+            self.found.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.found:
+            self.found[-1] += data
+
+
+def read_markdown(text: str) -> list[str]:
+    cells = Cells()
+    cells.feed(MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(text))
+    return [cell.strip() for cell in cells.found]
+
+
+PIECES = st.sampled_from(
+    ["*", "_", "`", "~~", "[", "](", "x](y)", "![", "<b>", "&lt;", "|", "\\", "a", "b_c", " ", "$", "#"]
+)
+
+
+@given(st.lists(PIECES, min_size=1).map("".join) | st.text(st.characters(categories=["L", "P", "S", "Zs"]), min_size=1))
+@example("<script>alert(1)</script>")
+@example("[click](javascript:alert(1))")
+@example("&copy; __a__ *b* `c` ~~d~~ http://e.f \\| g")
+def test_whatever_a_name_is_markdown_shows_it(name):
+    shown = " ".join(name.split())
+    table = (
+        f"| {in_markdown(shown)} | b |\n| --- | --- |\n| {in_markdown(shown)} | d |\n\n- name: {in_markdown(shown)}\n"
+    )
+    heading, _, cell, _, item = read_markdown(table)
+    assert (heading, cell, item) == (shown, shown, f"name: {shown}".strip())
 
 
 def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):

@@ -82,9 +82,34 @@ def test_git_lfs_pointer(path):
     assert problem(path) == "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
 
 
-def test_another_format_says_what_it_starts_with(path):
+MADE = "; docs/converters.md says what makes a recording of such files"
+BYTES = "a file whose first bytes are"
+
+
+def test_a_bag_of_ros_1(path):
     path.write_bytes(b"#ROSBAG V2.0\n" + bytes(200))
-    assert problem(path) == r"expected an MCAP file, found one that starts with b'#ROSBAG V2.0\n\x00\x00\x00'"
+    assert problem(path) == (
+        "a bag of ROS 1, which is not read; `rosbags-convert --src FILE --dst FOLDER --dst-storage mcap` makes a "
+        "folder of it that is"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "found"),
+    [
+        ("table.csv", b"t,id,x,y\r\n0.0,1,3.5,4\r\n", "a table with the columns t,id,x,y" + MADE),
+        ("labels.json", b'{\n "openlabel": {', "text that begins with '{'" + MADE),
+        ("notes", "größer\n".encode(), "text that begins with 'größer'"),
+        ("notes", b"x" * 63 + "ü".encode(), f"text that begins with '{'x' * 63}'"),  # cut off within a character
+        ("picture", b"\x89PNG\r\n\x1a\n" + bytes(60), f"{BYTES} 89 50 4e 47 0d 0a 1a 0a" + " 00" * 8),
+        ("latin", "größer\n".encode("latin-1"), f"{BYTES} 67 72 f6 df 65 72 0a"),
+        ("nearly", b"text\x00", f"{BYTES} 74 65 78 74 00"),
+    ],
+)
+def test_another_format_says_what_it_begins_with(path, name, content, found):
+    path = path.with_name(name)
+    path.write_bytes(content)
+    assert problem(path) == f"expected an MCAP file, found {found}"
 
 
 def test_nothing_but_the_magic(path):

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+import re
+import tracemalloc
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -234,6 +236,35 @@ class TestStrangeYaml:
         found = problems(tmp_path, changed("logs: &logs [*logs]"))
         assert found[0] == "2: logs[0]: an alias of something that holds it"
 
+    @pytest.mark.parametrize(
+        "inner", ["[*{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}, *{0}]", "{{a: *{0}, b: *{0}}}"]
+    )
+    def test_aliases_of_aliases_of_aliases(self, tmp_path: Path, inner: str) -> None:
+        """Ten of ten, ten times over, are ten thousand million values; two of two, forty times, a million million."""
+        depth = 10 if inner.startswith("[") else 40
+        bomb = "".join(f"a{k + 1}: &a{k + 1} {inner.format(f'a{k}')}\n" for k in range(depth))
+        tracemalloc.start()
+        try:
+            said = refusal(tmp_path, "a0: &a0 [lol]\n" + bomb)
+            assert tracemalloc.get_traced_memory()[1] < 200e6
+        finally:
+            tracemalloc.stop()
+        assert re.fullmatch(
+            r"\d+: expected aliases that stand for at most 200000 characters and values in all, found more .*", said
+        )
+
+    def test_a_long_text_that_is_repeated(self, tmp_path: Path) -> None:
+        said = refusal(tmp_path, f"a: &a {'x' * 50_000}\nb: [*a, *a, *a, *a]\n")
+        assert said.startswith("1: expected aliases that stand for at most 200000 characters")
+
+    def test_a_couple_that_a_hundred_pems_share(self, tmp_path: Path) -> None:
+        first, _, rest = TEXT.partition("units:")
+        pems = "".join(f"  p{k}: *shared\n" for k in range(100))
+        shared = first.replace("  onboard:\n", "  onboard: &shared\n") + pems + "units:" + rest
+        found = experiment(tmp_path, shared)
+        assert len(found.pems) == 101
+        assert found.pems["p99"] == found.pems["onboard"]
+
     @pytest.mark.parametrize("key", ["[1, 2]", "{a: 1}"])
     def test_key_that_is_no_scalar(self, tmp_path: Path, key: str) -> None:
         expected = "19: expected text or a number as a key, found a list or keys and values"
@@ -302,6 +333,11 @@ CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, anima
 FUSIONS = "ideal, union, nms, gnn, tracker"
 ONSETS = "'starts_moving', 'appears', 'in_range', 'line_of_sight', 'line_of_sight_any', 'at'"
 KINDS = "expected {kind: …}, kind one of visible_share, constant, table; found "
+CORNERS = "expected the corners in order around an area, each once"
+IN_PLANE = "expected two numbers, in the plane"
+HOW_MANY = "expected how many units beside the ego's, such as 2 (a count, no names)"
+SEEDS = st.integers(-(2**63), 2**64 - 1)
+SEED = "4: seed: expected a whole number of 64 bits (-2^63 … 2^64 - 1), found "
 EITHER = "expected one of `pem: <name>` and `recorded: {topic: …}`"
 RECORDED = "recorded: goes with one place, `on` an object or `at` a point, and without rate_hz"
 PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`"
@@ -319,6 +355,8 @@ CASES = [
     (TOP, "runs: true", "3: runs: expected a whole number, found true"),
     (TOP, "runs:", "3: runs: expected a whole number, found nothing"),
     (TOP, "seed: 1_000", "4: seed: expected a whole number, found '1_000'"),
+    (TOP, "seed: 18446744073709551616", SEED + "18446744073709551616"),
+    (TOP, "seed: -9223372036854775809", SEED + "-9223372036854775809"),
     (TOP, "read: {topic: 5}", "19: read.topic: expected text, found 5"),
     (TOP, "window_s: [2, 1]", "19: window_s: expected [from, to], found one that ends (1 s) before it begins (2 s)"),
     (TOP, "window_s: [-1, 1]", "19: window_s[0]: expected at least 0, found -1"),
@@ -341,6 +379,8 @@ CASES = [
     (WHEN, "range_m: [0, 1, 2]", ".range_m: expected at most 2 in the list, found [0, 1, 2]"),
     (WHEN, "range: [0, 1]", ".range: unknown key; did you mean range_m?"),
     (WHEN, "azimuth_deg: [1]", ".azimuth_deg[1]: missing"),
+    (WHEN, "azimuth_deg: [-400, 60]", ".azimuth_deg: expected degrees from -360 to 360, found -400"),
+    (WHEN, "azimuth_deg: [0, 360.5]", ".azimuth_deg: expected degrees from -360 to 360, found 360.5"),
     (WHEN, "classes: car", ".classes: expected a list, found 'car'"),
     (WHEN, "classes: []", ".classes: expected at least 1 in the list, found []"),
     (WHEN, "classes: [car, cow]", f".classes[1]: expected one of {CLASSES}; found 'cow'"),
@@ -361,6 +401,11 @@ CASES = [
     (DETECTION, "kind: table, probability: []",
      ": probability: expected 1 rows (range_m) of 1 values (visible_share), found 0 rows of []"),
     (ERROR, "kind: gaussian", ".covariance_m2: missing"),
+    (ERROR, "kind: gaussian, covariance_m2: [[1, 0], [0, 1]], sigma_m: 0.5",
+     ".sigma_m: unknown key; `covariance_m2: [[0.25, 0], [0, 0.25]]` says it"),
+    (ERROR, "kind: gaussian, sigma_m: [1, 2]",
+     ".covariance_m2: missing",
+     ".sigma_m: unknown key; `covariance_m2: [[σ², 0], [0, σ²]]` says it"),
     (ERROR, "kind: gaussian, covariance_m2: [1, 2]",
      ".covariance_m2[0]: expected a list, found 1",
      ".covariance_m2[1]: expected a list, found 2"),
@@ -405,10 +450,18 @@ CASES = [
      "vehicle, vru, vehicles; found 'cra'",
      ".on.share: expected at most 1, found 2"),
     (UNIT, "on: {classes: [car]}, pem: onboard", ".on.share: missing"),
+    (UNIT, "on: {classes: [car], share: 30}, pem: onboard",
+     ".on.share: expected at most 1, found 30; a fraction: 30 % is 0.3"),
+    (UNIT, "on: {classes: [car], share: 300}, pem: onboard", ".on.share: expected at most 1, found 300"),
     (UNIT, "on: [1], pem: onboard", ".on: expected text, found [1]"),
     (UNIT, "on: ego, height_m: -1, pem: onboard", ".height_m: expected at least 0, found -1"),
     (UNIT, "on: ego, height_m: '1', pem: onboard", ".height_m: expected a number, found '1'"),
     (MAST, "at: [0], height_m: 1, pem: onboard", ".at[1]: missing"),
+    (MAST, "at: [12.0, -4.5, 5.0], height_m: 1, pem: onboard",
+     f".at: {IN_PLANE}, found [12.0, -4.5, 5.0]; the height above ground is `height_m`"),
+    (UNIT, "on: ego, offset_m: [1, 0, 2], pem: onboard",
+     f".offset_m: {IN_PLANE}, found [1, 0, 2]; the height above ground is `height_m`"),
+    (MAST, "at: [1, 2, 3, 4], height_m: 1, pem: onboard", ".at: expected at most 2 in the list, found [1, 2, 3, 4]"),
     (MAST, "at: [a, 1e300], height_m: 1, pem: onboard",
      ".at[0]: expected a number, found 'a'",
      ".at[1]: expected at most 1e+12, found 1e+300"),
@@ -438,6 +491,9 @@ CASES = [
     (SWEEP, "{units: [1.5, -1]}",
      ".units[0]: expected a whole number, found 1.5",
      ".units[1]: expected at least 0, found -1"),
+    (SWEEP, "{units: [ego, 2]}", f".units[0]: {HOW_MANY}, found 'ego'"),
+    (SWEEP, "{units: [1, [ego, mast]]}", f".units[1]: {HOW_MANY}, found ['ego', 'mast']"),
+    (SWEEP, "{share: [0, 50]}", ".share[1]: expected at most 1, found 50; a fraction: 50 % is 0.5"),
     (SWEEP, "{latency: [1]}", ".latency: unknown key; did you mean latency_s?"),
     (PEM, "", ": expected keys and values, found nothing"),
     (PEM, "{}", ".units: missing"),
@@ -508,7 +564,11 @@ CASES = [
      "[0].polygon_m: expected at least 3 in the list, found [[0, 0], [1, 1]]"),
     (OBSTACLES, "[{polygon_m: [[0, 0], [1, 1], a], height_m: 1}]", "[0].polygon_m[2]: expected a list, found 'a'"),
     (OBSTACLES, "[{polygon_m: [[0, 0], [1, 1], [1, 0], [0, 1]], height_m: 1}]",
-     "[0]: polygon_m: expected a simple polygon, found Self-intersection[0.5 0.5]"),
+     f"[0]: polygon_m: {CORNERS}, found edges that cross or overlap at [0.5, 0.5]"),
+    (OBSTACLES, "[{polygon_m: [[0, 0], [4, 0], [4, 4], [2, 0], [0, 4]], height_m: 1}]",
+     f"[0]: polygon_m: {CORNERS}, found edges that meet at [2, 0]"),
+    (OBSTACLES, "[{polygon_m: [[0, 0], [0, 0], [0, 0]], height_m: 1}]",
+     f"[0]: polygon_m: {CORNERS}, found corners without an area between them"),
     (SHOW, "3", ": expected keys and values, found 3"),
     (SHOW, "{logs: first}", ".logs: expected a list, found 'first'"),
     (SHOW, "{logs: []}", ".logs: expected at least 1 in the list, found []"),
@@ -766,7 +826,7 @@ class TestRoundTrip:
         again = experiment(tmp_path, plain_yaml.dump(first.as_written()))
         assert again == first
 
-    @given(st.lists(st.text(min_size=1, max_size=90), min_size=1, max_size=4, unique=True), st.integers(), st.text())
+    @given(st.lists(st.text(min_size=1, max_size=90), min_size=1, max_size=4, unique=True), SEEDS, st.text())
     def test_any_names(self, names: list[str], seed: int, ego: str) -> None:
         names = [name for name in names if name not in ("default", "truth", "all")]
         shown = [name for name in names if name.isprintable() and "/" not in name] or ["GT"]

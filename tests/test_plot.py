@@ -206,7 +206,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("damage", "said"),
         [
-            (lambda log: log.unlink(), "drive.mcap: cannot be read: No such file or directory; put the log back"),
+            (lambda log: log.unlink(), "drive.mcap: cannot be opened: No such file or directory; put the log back"),
             (lambda log: log.write_bytes(log.read_bytes() + b"x"), "drive.mcap: expected the log that was replayed"),
         ],
     )

@@ -207,7 +207,14 @@ class TestWhatIsSaid:
 
     def test_what_cannot_be_read(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(30)))
-        assert refused(path, unit={"topic": "obu"}) == "no osi3.SensorData on topic 'obu'; it is on ['rsu']"
+        assert refused(path, unit={"topic": "obu"}) == "no topic 'obu'; lists of units are on rsu"
+        assert (
+            refused(path, unit={"topic": "truth"}) == "topic 'truth' holds osi3.GroundTruth; lists of units are on rsu"
+        )
+        alone = write_recording(
+            tmp_path / "d.mcap", [(k / 10, [Obj(id=1), Obj(id=2, x=9.0)]) for k in range(3)], host=1
+        )
+        assert refused(alone, unit={"topic": "obu"}) == "no topic 'obu'; no topic of this log holds lists of a unit"
         path = drive(tmp_path / "b.mcap", list_of(0.5, car(30)), (ns(0.6), b"\xff\xff\xff"))
         assert refused(path).startswith("rsu: a message cannot be decoded: ")
         assert refused(drive(tmp_path / "c.mcap")) == "rsu: holds no list"

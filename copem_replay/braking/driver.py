@@ -12,8 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from copem_replay.components import Component, NotNegative, Positive, Slot, asked
-from copem_replay.errors import InputError
+from copem_replay.components import Component, NotNegative, Positive, Slot, asked, wrong
 from copem_replay.tracks import Float
 
 _SHORTEST_S = 0.05
@@ -121,12 +120,10 @@ def delays_of(reaction: Reaction, uniform: Float) -> Float:
     where = "braking.driver.reaction"
     found = asked(reaction, where, lambda: np.asarray(reaction.delays(uniform), dtype=float))
     if found.shape != uniform.shape:
-        raise InputError(
-            f"{where}: {reaction.kind}: delays(uniform): expected shape {uniform.shape}, found {found.shape}"
-        )
-    wrong = ~((found >= 0) & np.isfinite(found))
-    if wrong.any():
-        raise InputError(f"{where}: {reaction.kind}: delays(uniform): expected seconds ≥ 0, found {found[wrong][0]}")
+        raise wrong(reaction, where, f"delays(uniform): expected shape {uniform.shape}, found {found.shape}", "delays")
+    none = ~((found >= 0) & np.isfinite(found))
+    if none.any():
+        raise wrong(reaction, where, f"delays(uniform): expected seconds ≥ 0, found {found[none][0]}", "delays")
     return found
 
 
@@ -134,10 +131,11 @@ def deceleration_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float
     """(R, T) what a driver model says of `elapsed_s (R, T)` and `speed_mps (R, 1)`, checked. Raises InputError."""
     where = "braking.driver"
     found = asked(driver, where, lambda: np.asarray(driver.deceleration_mps2(elapsed_s, speed_mps), dtype=float))
-    what = f"{where}: {driver.kind}: deceleration_mps2(elapsed_s, speed_mps)"
+    method = "deceleration_mps2"
+    what = f"{method}(elapsed_s, speed_mps)"
     if found.shape != elapsed_s.shape:
-        raise InputError(f"{what}: expected shape {elapsed_s.shape}, found {found.shape}")
-    wrong = ~((found >= 0) & np.isfinite(found))
-    if wrong.any():
-        raise InputError(f"{what}: expected m/s² ≥ 0, found {found[wrong][0]}")
+        raise wrong(driver, where, f"{what}: expected shape {elapsed_s.shape}, found {found.shape}", method)
+    none = ~((found >= 0) & np.isfinite(found))
+    if none.any():
+        raise wrong(driver, where, f"{what}: expected m/s² ≥ 0, found {found[none][0]}", method)
     return found

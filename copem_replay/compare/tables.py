@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from copem_replay.compare.comparison import Comparison
 from copem_replay.compare.regret import METRICS
 from copem_replay.errors import OutputError
 from copem_replay.table import as_text
+from copem_replay.wording import printable
 
 _SUFFIXES = (".csv", ".md")
 _RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
@@ -30,8 +32,8 @@ def comparison_markdown(comparison: Comparison) -> str:
     cells = _cells(comparison)
     notes = (f"note: {note}" for note in comparison.notes)
     rows = [list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)]
-    lines = ["| " + " | ".join(_escaped(str(cell)) for cell in row) + " |" for row in rows]
-    return "\n".join([*lines, "", *(f"- {_escaped(line)}" for line in (*comparison_lines(comparison), *notes)), ""])
+    lines = ["| " + " | ".join(in_markdown(str(cell)) for cell in row) + " |" for row in rows]
+    return "\n".join([*lines, "", *(f"- {in_markdown(line)}" for line in (*comparison_lines(comparison), *notes)), ""])
 
 
 def check_out(path: Path) -> None:
@@ -109,5 +111,12 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
             yield f"better than {comparison.baseline} in {metric}, the interval excluding 0: {names}"
 
 
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("|", "\\|")
+_HTML = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
+_MARKDOWN = re.compile(r"[\\`*~|$]|(?<![^\W_])_|_(?![^\W_])|!(?=\[)|\](?=[(\[])|:(?=//)")
+"""What begins something in Markdown wherever it stands; `_` only at the edge of a word, `]` only before a target."""
+
+
+def in_markdown(text: str) -> str:
+    """Text that reads as itself, on one line, in Markdown and in the HTML that it becomes."""
+    html = re.sub("[&<>]", lambda found: _HTML[found[0]], printable(text))
+    return _MARKDOWN.sub(r"\\\g<0>", html)

@@ -8,8 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from copem_replay.components import Component, asked
-from copem_replay.errors import InputError
+from copem_replay.components import Component, GivenError, asked, wrong
 from copem_replay.fusion.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
 from copem_replay.tracks import VALUES
 
@@ -116,11 +115,11 @@ class StepFusion(ListFusion):
             for k in range(instants):
                 given = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memories[s])
                 if not isinstance(given, tuple) or len(given) != 2:
-                    raise TypeError(f"step: expected a list and a memory, found {type(given).__name__}")
+                    raise GivenError("step", f"expected a list and a memory, found {type(given).__name__}")
                 entries, memories[s] = given
                 if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY or entries.ndim != 1:
                     found = entries.dtype.name if isinstance(entries, np.ndarray) else type(entries).__name__
-                    raise TypeError(f"step: expected a list (an array of ENTRY) and a memory, found {found}")
+                    raise GivenError("step", f"expected a list (an array of ENTRY) and a memory, found {found}")
                 parts.append(entries)
                 total += len(entries)
                 start[s, k + 1] = total
@@ -136,7 +135,7 @@ def resumed_by(fusion: ListFusion, reports: Reports, memory: Any, where: str) ->
     """What a `resumable` fusion gives of the next stretch and remembers, checked as `fused_by` does."""
     given = asked(fusion, where, lambda: fusion.resume(reports, memory))
     if said := pair_problem(given):
-        raise InputError(f"{where}: {fusion.kind}: {said}")
+        raise wrong(fusion, where, said, "resume")
     found, memory = given
     return _checked(found, fusion, reports, where), memory
 
@@ -144,7 +143,7 @@ def resumed_by(fusion: ListFusion, reports: Reports, memory: Any, where: str) ->
 def _checked(found: Lists, fusion: ListFusion, reports: Reports, where: str) -> Lists:
     said = form_problem(found, reports) or content_problem(found, reports)
     if said is not None:
-        raise InputError(f"{where}: {fusion.kind}: {said}")
+        raise wrong(fusion, where, said, "step", "fuse", "resume")
     return found
 
 

@@ -23,6 +23,13 @@ def _ascending(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _one_turn(value: tuple[float, float]) -> tuple[float, float]:
+    beyond = [angle for angle in value if abs(angle) > 360]
+    if beyond:
+        raise ValueError(f"expected degrees from -360 to 360, found {beyond[0]:g}")
+    return value
+
+
 def _class_name(value: str) -> str:
     if value not in CLASSES and value not in CLASS_GROUPS:
         known = ", ".join([*CLASSES, *CLASS_GROUPS])
@@ -38,7 +45,7 @@ class Condition(Frozen):
     """When a couple applies. All that is given must hold; bounds are included."""
 
     range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ascending)] | None = None
-    azimuth_deg: tuple[Number, Number] | None = None
+    azimuth_deg: Annotated[tuple[Number, Number], AfterValidator(_one_turn)] | None = None
     classes: ClassNames | None = None
     visible_share: Annotated[tuple[Share, Share], AfterValidator(_ascending)] | None = None
 

@@ -9,8 +9,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.components import Component, NotNegative, Share, asked
-from copem_replay.errors import InputError
+from copem_replay.components import Component, NotNegative, Share, asked, wrong
 from copem_replay.pem.look import Look
 from copem_replay.tracks import Float
 
@@ -28,10 +27,10 @@ def probability_of(model: DetectionModel, look: Look, where: str) -> Float:
     found = asked(model, where, lambda: np.asarray(model.probability(look), dtype=float))
     expected = (len(look.range_m),)
     if found.shape != expected:
-        raise InputError(f"{where}: {model.kind}: probability(look): expected shape {expected}, found {found.shape}")
-    wrong = ~((found >= 0) & (found <= 1 + 1e-12))
-    if wrong.any():
-        raise InputError(f"{where}: {model.kind}: probability(look): expected 0 … 1, found {found[wrong][0]}")
+        raise wrong(model, where, f"probability(look): expected shape {expected}, found {found.shape}", "probability")
+    beyond = ~((found >= 0) & (found <= 1 + 1e-12))
+    if beyond.any():
+        raise wrong(model, where, f"probability(look): expected 0 … 1, found {found[beyond][0]}", "probability")
     return found
 
 

@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator
 
-from copem_replay.components import Component, NotNegative, Number, asked
-from copem_replay.errors import InputError
+from copem_replay.components import Component, NotNegative, Number, asked, wrong
 from copem_replay.pem.look import Errors, Look, Noise
 from copem_replay.tracks import Float
 
@@ -27,7 +26,7 @@ def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str
     """What a model says, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
     found = asked(model, where, lambda: model.perturb(look, noise))
     if not isinstance(found, Errors):
-        raise InputError(f"{where}: {model.kind}: perturb(look, noise): expected Errors, found {type(found).__name__}")
+        raise wrong(model, where, f"perturb(look, noise): expected Errors, found {type(found).__name__}", "perturb")
     n = len(look.range_m)
     for field in fields(found):
         values = getattr(found, field.name)
@@ -37,9 +36,9 @@ def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str
         expected = (n,) if variance else (3, runs, n) if field.name == "size_m" else (runs, n)
         shape = np.shape(values)
         if shape != expected:
-            raise InputError(f"{where}: {model.kind}: perturb: {field.name}: expected shape {expected}, found {shape}")
+            raise wrong(model, where, f"perturb: {field.name}: expected shape {expected}, found {shape}", "perturb")
         if not np.isfinite(values).all():
-            raise InputError(f"{where}: {model.kind}: perturb: {field.name}: expected numbers, found NaN or infinity")
+            raise wrong(model, where, f"perturb: {field.name}: expected numbers, found NaN or infinity", "perturb")
     return found
 
 

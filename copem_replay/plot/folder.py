@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.belongings import check_still
+from copem_replay.csv_names import as_named
 from copem_replay.errors import InputError
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import Source, load, parse
@@ -112,7 +113,7 @@ def _csv(path: Path) -> pd.DataFrame:
     """A table of which names stay text and what is empty is missing, whatever else a name looks like."""
     text = {"configuration": str, "sweep": str}
     table = pd.read_csv(path, dtype=text, na_values=[""], keep_default_na=False)
-    return table.fillna({name: "" for name in text if name in table})
+    return as_named(table.fillna({name: "" for name in text if name in table}), [n for n in text if n in table])
 
 
 def _read(path: Path, reader: Callable[[Path], pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:

@@ -35,10 +35,8 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
     file = next(file for file in results.logs if file.name == log)
     try:
         found = sha256_of(file.path)
-    except OSError as error:
-        raise RecordingError(
-            f"{file.path}: cannot be read: {error.strerror}; put the log back to draw its runs"
-        ) from None
+    except RecordingError as error:
+        raise RecordingError(f"{error}; put the log back to draw its runs") from None
     if found != file.sha256:
         raise RecordingError(
             f"{file.path}: expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {found[:12]}…; "
