@@ -178,7 +178,7 @@ def test_the_page_shows_commands_that_are_understood_and_a_table_that_converts(r
 
     page = (ROOT / "docs" / "converters.md").read_text(encoding="utf-8")
     commands = re.findall(r"`python tools/convert\.py (.*?)`", page)
-    assert len(commands) == 7
+    assert len(commands) == 8
     for command in commands:
         convert.parser().parse_args(shlex.split(command))
     (table,) = re.findall(r"```csv\n(.*?)```", page, re.DOTALL)

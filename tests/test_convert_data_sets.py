@@ -318,6 +318,12 @@ def test_scenarionet_folder_without_a_mapping_and_with_one_that_is_none(
     assert "note: no ego vehicle: no sdc_id (1 recording)\n" in printed.out
     assert "note: no ego vehicle: no track nobody (sdc_id) (1 recording)\n" in printed.out
     assert sorted(path.name for path in out.iterdir()) == ["0.mcap", "sd_a.mcap"]
+    # Where nothing can be written, all is said once.
+    place = run.file("place", "") / "out"
+    assert convert.main(["scenarionet", str(run.folder / "w"), str(place)]) == 2
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith(f"{place / '0.mcap'}: cannot be written: ")
+    assert last == "3 of 3 scenarios not converted"
 
 
 def test_scenarionet_folders_that_are_refused(run: Runner, capsys: pytest.CaptureFixture[str]) -> None:

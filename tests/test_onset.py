@@ -44,6 +44,16 @@ def test_who_leaves_with_the_ego_has_left() -> None:
     }
 
 
+@pytest.mark.parametrize(("later_us", "ended_by"), [(1, "object_left"), (2, "ego_left")])
+def test_a_microsecond_is_the_same_frame(later_us: int, ended_by: str) -> None:
+    things = [
+        Thing("ego", "car", standing(0, 0), there=lambda t: t < 0.5e-6),
+        Thing("other", "car", standing(20, 0), there=lambda t: t < (later_us + 0.5) * 1e-6),
+    ]
+    found = looked(recording(things, until_s=9e-6, rate_hz=1e6), measure={"onset": {"kind": "appears"}})
+    assert found["other"][3] == ended_by
+
+
 def test_who_is_in_range_when_the_ego_comes_was_so_from_the_start() -> None:
     """The ego is in the log from 1 s on. What holds at the first frame that both share held already."""
     things = [

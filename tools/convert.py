@@ -156,7 +156,7 @@ def main(words: list[str] | None = None) -> int:
     wrong: list[str] = []
     notes: Counter[tuple[str, str]] = Counter()
     assumed: Counter[str] = Counter()
-    numbered, wanted = False, dict[Path, Path]()
+    numbered, done, wanted = False, 0, dict[Path, Path]()
     try:
         wanted = recordings(given)
     except InputError as error:
@@ -170,13 +170,14 @@ def main(words: list[str] | None = None) -> int:
         except OSError as error:
             wrong.append(f"{output}: cannot be written: {error.strerror or error}")
             break
+        done += 1
         objects = ", ".join(f"{many} {name}" for name, many in sorted(report.objects.items()))
         print(f"{output}: {counted(report.frames, 'frame')}, {objects}")
         notes += report.counts
         assumed.update(list(report.assumed))
         numbered |= any(name != str(ident) for ident, name in report.names.items())
     _tell(assumed, notes, numbered, len(wanted))
-    _complain(wrong, len(wanted))
+    _complain(wrong, len(wanted) - done, len(wanted))
     return 2 if wrong else 0
 
 
@@ -191,12 +192,13 @@ def _tell(assumed: Counter[str], notes: Counter[tuple[str, str]], numbered: bool
         print(f"note: objects are numbered; the file's metadata record {RECORD} has their names")
 
 
-def _complain(wrong: list[str], recordings: int) -> None:
+def _complain(wrong: list[str], left: int, recordings: int) -> None:
+    """Print what is wrong, a line each, and of many recordings how many there are not."""
     print("\n".join(wrong[:_MOST_LINES]), end="\n" if wrong else "", file=sys.stderr)
     if len(wrong) > _MOST_LINES:
         print(f"… and {len(wrong) - _MOST_LINES} more", file=sys.stderr)
     if wrong and recordings > 1:
-        print(f"{len(wrong)} of {counted(recordings, 'scenario')} not converted", file=sys.stderr)
+        print(f"{left} of {counted(recordings, 'scenario')} not converted", file=sys.stderr)
 
 
 if __name__ == "__main__":

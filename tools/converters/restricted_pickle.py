@@ -66,6 +66,7 @@ class _Array(np.ndarray[Any, Any]):
         if type(content) is not (list if dtype.hasobject else bytes) or len(content) != expected:
             raise pickle.UnpicklingError(f"an array of shape {shape} with other content")
         self.take_from(expected)
+        del self.take_from
         super().__setstate__((1, shape, dtype, bool(fortran), content))
 
     def __repr__(self) -> str:
