@@ -94,10 +94,9 @@ class Original:
         except DAMAGE:
             return False
         self.profile = header.profile if isinstance(header, Header) else ""
-        self.metadata = {}
-        for record in metadata:  # rosbag2 writes one name several times
+        for record in metadata:
             if isinstance(record, Metadata):
-                self.metadata.setdefault(record.name, {}).update(record.metadata)
+                self._keep(record)
         self.attachments = [record for record in attachments if isinstance(record, Attachment)]
         self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
         return True
@@ -109,10 +108,14 @@ class Original:
                 if isinstance(record, Header):
                     self.profile = record.profile
                 elif isinstance(record, Metadata):
-                    self.metadata.setdefault(record.name, dict(record.metadata))
+                    self._keep(record)
                 elif isinstance(record, Attachment):
                     self.attachments.append(record)
         self._schemas, self.channels = stream.schemas, stream.channels
+
+    def _keep(self, record: Metadata) -> None:
+        """Keep a metadata record, with what others of its name say: rosbag2 writes one name several times."""
+        self.metadata.setdefault(record.name, {}).update(record.metadata)
 
     def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
         """Schemas, channels and attachments put into the output. Returns the new number of each channel.

@@ -74,7 +74,7 @@ class Runner:
         return path
 
     def __call__(self, kind: str, source: Path, *options: str | Path) -> Converted:
-        status = convert.main([kind, str(source), str(self.output), *map(str, options)])
+        status = convert.main([kind, str(source), str(self.output), "--overwrite", *map(str, options)])
         printed = self.capsys.readouterr()
         assert (status, printed.err) == (0, "")
         with self.output.open("rb") as stream:

@@ -309,6 +309,15 @@ def test_expected_calibration_error() -> None:
     assert figure("existence_error", ends) == pytest.approx(0.5)
 
 
+def test_claims_that_are_too_high_do_not_make_up_for_those_that_are_too_low() -> None:
+    # Two entries at 0.25 are of the car, two at 0.75 of nothing: off by 0.75 each way.
+    of = assessed(
+        [entry(10, existence=0.25)] * 2 + [entry(50, existence=0.75)] * 2,
+        places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)},
+    )  # fmt: skip
+    assert figure("existence_error", of) == pytest.approx(0.75)
+
+
 def test_bands_of_distance_and_time() -> None:
     # The car is 10, 20, 30 and 40 m away; the list at 2 s misses it, one ghost is 15 m away at 3 s.
     lists = [entry(11), entry(20, 2), NOTHING, one_list(entry(40), entry(0, 15))]

@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from braking_oracle import Motion, corners, outcome
-from copem_replay.braking.boxes import box_distance
+from copem_replay.braking.boxes import box_distance, nearest, pose_on, turning
 from copem_replay.braking.driver import (
     ConstantDeceleration,
     ConstantReaction,
@@ -1249,3 +1249,45 @@ def test_two_in_conflict_have_no_interval_and_it_is_said() -> None:
     result = run(plan(runs=3), [recording(things, until_s=4.0)])
     assert result.summary["pass_interval"].isna().all()
     assert any("no interval of the pass share: fewer than 5 logs and fewer than 5 objects" in n for n in result.notes)
+
+
+# ------------------------------------------------------------------------------------------------ at the boundaries
+
+
+def test_an_impact_is_no_pass_though_the_margin_is_0() -> None:
+    # 6.25 m to a stop: 5 m are not enough, and the boxes touch, at a distance of 0.
+    for range_m, passes, distance_m in ((5.0, False, 0.0), (6.5, True, 0.25)):
+        (row,) = rows(in_the_way(range_m), plan(margin_m=0.0)).itertuples()
+        assert (row.braking_pass, row.min_distance_m) == (passes, pytest.approx(distance_m, abs=5e-3))
+
+
+def test_beyond_its_ends_a_path_goes_straight_on() -> None:
+    path = np.array([[0.0, 0, 0, 0.2], [10.0, 10, 0, 0.7]])  # arc length, x, y, yaw
+    assert pose_on(path, 5.0) == pytest.approx((5, 0, 0.45))
+    assert pose_on(path, 20.0) == pytest.approx((20, 0, 0.7)), "turned no further"
+    assert pose_on(path, -10.0) == pytest.approx((-10, 0, 0.2))
+
+
+def test_how_far_a_corner_moves_while_the_ego_turns() -> None:
+    # 4 m × 3 m: a corner is 2.5 m from the middle, half a radian on the second metre moves it by 1.25 m more.
+    path = np.array([[0.0, 0, 0, 0], [1.0, 1, 0, 0], [2.0, 2, 0, -0.5]])
+    assert turning(path, np.array([4.0, 3.0])) == pytest.approx(2.25)
+    assert turning(path[:2], np.array([4.0, 3.0])) == 1.0
+
+
+@pytest.mark.parametrize("who", ["ego", "other"])
+def test_a_bar_that_turns_on_the_spot_hits_what_it_sweeps_over(who: str) -> None:
+    """10 m × 1 m, by half a turn: before and after 2.5 m from a box that its end reaches half way."""
+    instants = np.linspace(0.0, 1.0, 5)
+    bar, box, still = np.array([10.0, 1.0]), np.array([2.0, 2.0]), np.zeros(5)
+    near, touch = np.empty(1), np.empty(1)
+    if who == "ego":
+        path = np.array([[0.0, 0, 0, 0], [1e-6, 1e-6, 0, math.pi]])
+        nearest((instants * 1e-6)[None], path, bar, np.stack([still, still + 4.0, still]), box, near, touch)
+    else:
+        path = np.array([[0.0, 0, 4, 0], [1e-6, 1e-6, 4, 0]])
+        nearest(still[None], path, box, np.stack([still, still, instants * math.pi]), bar, near, touch)
+    assert near[0] == 0
+    # A long side, half a metre from the middle, meets the box's lower corner at (±1, 3), √10 m away, where the corner's
+    # bearing from the bar is asin(0.5 / √10): at atan2(3, 1) less that.
+    assert touch[0] / 4 * math.pi == pytest.approx(math.atan2(3, 1) - math.asin(0.5 / math.sqrt(10)), abs=1e-3)

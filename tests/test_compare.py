@@ -307,3 +307,13 @@ def test_all_metrics_of_a_pair_are_resampled_alike_or_not_at_all(tmp_path):
     comparison = compared(tmp_path, rows)
     assert of(comparison, "ttd_rmst_s")["interval_over"] == "logs"
     assert set(comparison.table[comparison.table["log"] == "all"]["interval_over"].dropna()) == {"logs"}
+
+
+def test_of_a_detection_and_a_censoring_at_one_time_the_detection_comes_first(tmp_path):
+    """Both after 0.2 s: of two who are looked at then one is detected. 1 − 0.8 is less than that by a rounding."""
+    assert 1 - 0.8 < 0.2
+    censored = {"onset_s": 0.8, "ended_s": 1.0, "ended_by": "log_end"}
+    rows = [row("ideal", 0.2, 30.0), row("late", 0.2, 30.0)]
+    rows += [row(name, None, object_id="8", **censored) for name in ("ideal", "late")]
+    time = of(compared(tmp_path, rows, measure={"horizon_s": 1.0}), "ttd_rmst_s")
+    assert time["value"] == pytest.approx(0.2 + 0.5 * 0.8)

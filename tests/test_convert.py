@@ -78,9 +78,23 @@ def test_a_failure_midway_leaves_the_old_file_alone(run: Runner) -> None:
     bad = run.file("bad.xml", f"<fcd-export>{step.format(0)}{step.format(0)}</fcd-export>")
     run("sumo", good)
     before = run.output.read_bytes()
-    assert convert.main(["sumo", str(bad), str(run.output)]) == 2
+    assert convert.main(["sumo", str(bad), str(run.output), "--overwrite"]) == 2
     assert run.output.read_bytes() == before
     assert list(run.output.parent.iterdir()) == [run.output]
+
+
+def test_what_is_there_already_is_replaced_only_when_that_is_asked_for(
+    run: Runner, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = run.file("table.csv", f"{HEADER}\n{CAR}\n")
+    there = run.file("there.mcap", "of another day")
+    words = ["csv", str(source), str(there)]
+    assert convert.main(words) == 2
+    assert capsys.readouterr().err == f"{there}: is there already; give another name, or --overwrite\n"
+    assert there.read_text() == "of another day"
+    assert convert.main([*words, "--overwrite"]) == 0
+    assert survey(there)["readable"]
+    assert sorted(path.name for path in run.folder.iterdir()) == ["table.csv", "there.mcap"]
 
 
 # CSV --------------------------------------------------------------------------------------------------------
@@ -164,7 +178,7 @@ def test_the_page_shows_commands_that_are_understood_and_a_table_that_converts(r
 
     page = (ROOT / "docs" / "converters.md").read_text(encoding="utf-8")
     commands = re.findall(r"`python tools/convert\.py (.*?)`", page)
-    assert len(commands) == 7
+    assert len(commands) == 8
     for command in commands:
         convert.parser().parse_args(shlex.split(command))
     (table,) = re.findall(r"```csv\n(.*?)```", page, re.DOTALL)

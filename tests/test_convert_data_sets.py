@@ -15,9 +15,10 @@ import pandas as pd
 import pytest
 from osi3.osi_object_pb2 import StationaryObject
 
-from conversions import Runner, run
+from conversions import Runner, convert, run
 from converters import restricted_pickle
 from copem_replay.errors import InputError
+from copem_replay.read import read
 
 __all__ = ["run"]
 
@@ -258,6 +259,95 @@ def test_scenarionet_refuses_what_it_does_not_know(run: Runner) -> None:
     assert "expected a pickle, found something else" in run.refused("scenarionet", run.file("s.pkl", b""))
 
 
+def counting(**more: Any) -> dict[str, Any]:
+    """A scenario as ScenarioNet writes it of Waymo's: its summary counts with a defaultdict."""
+    whole = scenario(ego=ego())
+    moving = collections.defaultdict(int, VEHICLE=1)
+    nested = collections.defaultdict(list, {"VEHICLE": [collections.defaultdict(set)]})
+    whole["metadata"] |= {"dataset": "waymo", "number_summary": {"moving": moving, "by type": nested}, **more}
+    return whole
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_scenarionet_of_waymo_counts_with_a_defaultdict(run: Runner, protocol: int) -> None:
+    path = run.file("w.pkl", pickle.dumps(counting(), protocol=protocol))
+    assert run("scenarionet", path).class_of("1") == "car"
+    found = restricted_pickle.load(path)["metadata"]["number_summary"]
+    assert found == {"moving": {"VEHICLE": 1}, "by type": {"VEHICLE": [{}]}}
+    assert type(found["moving"]) is dict  # nothing that makes up what it is asked for
+
+
+def test_scenarionet_whole_folder(run: Runner, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("w/w_0/sd_waymo_a.pkl", "w/w_1/sd_waymo_b.pkl", "w/w_1/sd_waymo_left_out.pkl"):
+        run.file(name, pickle.dumps(counting()))
+    summary = pickle.dumps({"sd_waymo_a.pkl": counting()["metadata"]})
+    for place in ("w", "w/w_0", "w/w_1"):
+        run.file(f"{place}/dataset_summary.pkl", summary)
+    run.file("w/w_0/dataset_mapping.pkl", pickle.dumps({"sd_waymo_a.pkl": ""}))
+    run.file("w/dataset_mapping.pkl", pickle.dumps({"sd_waymo_b.pkl": "w_1", "sd_waymo_a.pkl": "w_0"}))
+    out = run.folder / "out"
+    words = ["scenarionet", str(run.folder / "w"), str(out)]
+    assert convert.main(words) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[:2] == [f"{out / f'sd_waymo_{name}.mcap'}: 4 frames, 1 car" for name in "ab"]
+    assert "note: 8 states of the ego vehicle with length and width swapped (1.73×4.08 m): put right" in printed
+    assert sorted(path.name for path in out.iterdir()) == ["sd_waymo_a.mcap", "sd_waymo_b.mcap"]
+    assert read(out / "sd_waymo_b.mcap", name="b").host_id == "1"
+    # The same again is refused before anything is read, and done with --overwrite, to the same bytes.
+    before = (out / "sd_waymo_a.mcap").read_bytes()
+    assert convert.main(words) == 2
+    assert capsys.readouterr().err == (
+        f"{out / 'sd_waymo_a.mcap'}: is there already, and 1 other; give another name, or --overwrite\n"
+    )
+    assert convert.main([*words, "--overwrite"]) == 0
+    assert (out / "sd_waymo_a.mcap").read_bytes() == before
+
+
+def test_scenarionet_folder_without_a_mapping_and_with_one_that_is_none(
+    run: Runner, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run.file("w/deep/sd_a.pkl", pickle.dumps(counting(sdc_id="nobody")))
+    run.file("w/sd_b.pkl", b"nothing")
+    run.file("w/0.pkl", pickle.dumps(counting(sdc_id=None)))
+    out = run.folder / "out"
+    assert convert.main(["scenarionet", str(run.folder / "w"), str(out)]) == 2
+    printed = capsys.readouterr()
+    first, last = printed.err.splitlines()
+    assert first.startswith(f"{run.folder / 'w' / 'sd_b.pkl'}: expected a pickle, found something else")
+    assert last == "1 of 3 scenarios not converted"
+    assert "note: no ego vehicle: no sdc_id (1 recording)\n" in printed.out
+    assert "note: no ego vehicle: no track nobody (sdc_id) (1 recording)\n" in printed.out
+    assert sorted(path.name for path in out.iterdir()) == ["0.mcap", "sd_a.mcap"]
+    # Where nothing can be written, all is said once.
+    place = run.file("place", "") / "out"
+    assert convert.main(["scenarionet", str(run.folder / "w"), str(place)]) == 2
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith(f"{place / '0.mcap'}: cannot be written: ")
+    assert last == "3 of 3 scenarios not converted"
+
+
+def test_scenarionet_folders_that_are_refused(run: Runner, capsys: pytest.CaptureFixture[str]) -> None:
+    out = run.folder / "out"
+
+    def line(folder: str, output: Path = out) -> str:
+        assert convert.main(["scenarionet", str(run.folder / folder), str(output)]) == 2
+        assert not out.exists()
+        (found,) = capsys.readouterr().err.splitlines()
+        return str(found)
+
+    (run.folder / "empty").mkdir()
+    assert line("empty").endswith("empty: expected scenarios of ScenarioNet, found no *.pkl in the folder")
+    run.file("two/a/sd_x.pkl", pickle.dumps(counting()))
+    assert "expected a folder for the recordings of one, found a file's name" in line("two", run.folder / "x.mcap")
+    run.file("two/b/sd_x.pkl", pickle.dumps(counting()))
+    assert f"expected one scenario sd_x, found {run.folder / 'two' / 'a' / 'sd_x.pkl'} and " in line("two")
+    for hostile in ({"../sd_x.pkl": "two"}, {"sd_x.pkl": 1}, {"": "two"}):
+        run.file("two/dataset_mapping.pkl", pickle.dumps(hostile))
+        assert "dataset_mapping.pkl: expected files and their folders, found " in line("two")
+    run.file("two/dataset_mapping.pkl", pickle.dumps(["sd_x.pkl"]))
+    assert line("two").endswith("expected the folder of each scenario by its file, found list")
+
+
 class Shell:
     """Would run a command when it is unpickled."""
 
@@ -266,6 +356,68 @@ class Shell:
 
     def __reduce__(self) -> Any:
         return self.call, self.arguments
+
+
+class Built:
+    """Is made by a call, and then given a state."""
+
+    def __init__(self, call: Any, arguments: tuple[Any, ...], state: Any) -> None:
+        self.reduced = call, arguments, state
+
+    def __reduce__(self) -> Any:
+        return self.reduced
+
+
+def hostile_array(dtype: Any, shape: tuple[int, ...], content: Any) -> Built:
+    return Built(np.empty(0).__reduce__()[0], (np.ndarray, (0,), b"b"), (1, shape, dtype, False, content))
+
+
+# An object type that says of itself it holds no references: numpy would take the bytes for addresses.
+LYING = Built(np.dtype, ("O8", False, True), (3, "|", None, None, None, -1, -1, 0))
+
+
+@pytest.mark.parametrize(
+    ("hostile", "what"),
+    [
+        (hostile_array(LYING, (1,), b"A" * 8), r"an array of shape \(1,\) with other content"),
+        (hostile_array(np.dtype(object), (50_000_000,), []), "with other content"),  # read beyond the list
+        (hostile_array(np.dtype("f8"), (-1, -1), b"A" * 8), r"an array of shape \(-1, -1\)"),
+        (hostile_array(np.dtype("f8"), (2,), b"A" * 8), "with other content"),
+        (hostile_array("f8", (1,), b"A" * 8), "an array without a type"),
+        (hostile_array(np.dtype([("a", "f8")]), (1,), b"A" * 8), "an array of V8"),
+        (Built(np.dtype, ("i4", False, True), (3, "<", None, ("a",), {"a": 1}, 800, 1, 0)), "with parts"),
+        (Shell(np.float64(1).__reduce__()[0], np.dtype("S300000000")), "expected a pickle"),
+        (Shell(np.ndarray, (2**27,)), "not callable"),
+        (Shell(list, (1,)), "not callable"),
+        (Shell(collections.defaultdict, list, {}), "expected a pickle"),
+    ],
+)
+def test_a_pickle_says_nothing_that_numpy_would_believe(tmp_path: Path, hostile: Any, what: str) -> None:
+    path = tmp_path / "p.pkl"
+    for protocol in range(2, 6):
+        path.write_bytes(pickle.dumps({"metadata": hostile}, protocol=protocol))
+        with pytest.raises(InputError, match=what):
+            restricted_pickle.load(path)
+
+
+def test_a_pickle_cannot_hold_one_thing_too_often(tmp_path: Path) -> None:
+    path = tmp_path / "p.pkl"
+    bomb: list[Any] = []
+    for _ in range(40):
+        bomb = [bomb, bomb]  # 2⁴⁰ lists to whom looks at all of them
+    circle: list[Any] = []
+    circle.append(circle)
+    text, items = "x" * 10_000, list(range(1000))
+    shared = [Shell(set, items) for _ in range(1000)]  # a million places
+    for hostile in (bomb, [text] * 10_000, [np.zeros(1000)] * 1000, shared):
+        path.write_bytes(pickle.dumps(hostile))
+        with pytest.raises(InputError, match="far more content than it has bytes"):
+            restricted_pickle.load(path)
+    path.write_bytes(pickle.dumps(circle))
+    with pytest.raises(InputError, match="containers in each other, more than 100 deep"):
+        restricted_pickle.load(path)
+    path.write_bytes(pickle.dumps({"same": [items, items]}))  # a few times is no harm
+    assert restricted_pickle.load(path) == {"same": [items, items]}
 
 
 @pytest.mark.parametrize("protocol", range(6))
@@ -285,7 +437,7 @@ def test_a_pickle_may_hold_containers_numbers_strings_and_arrays(tmp_path: Path)
     fine = {
         "list": [1, 2.5, None, True, 1 + 2j, "ä", b"\xff"],
         "tuple": ({1}, frozenset({2}), collections.OrderedDict(a=1)),
-        "scalars": [np.float32(1.5), np.int64(7), np.bool_(True), np.str_("x")],
+        "scalars": [np.float32(1.5), np.int64(7), np.bool_(True), np.str_("x"), np.str_("")],
         "arrays": [np.arange(6.0).reshape(2, 3).T, np.array(["a", "bc"]), np.array([{"a": 1}, None], dtype=object)],
     }
     for protocol in range(6):

@@ -7,18 +7,22 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 
+import scenes
 from copem_replay import cli
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, parse
 from copem_replay.fusion.component import StepFusion
 from copem_replay.pem.detection import DetectionModel
 from copem_replay.pem.look import Look
+from copem_replay.replay import believed, prepare
 from copem_replay.run import Result
 from copem_replay.testing import check_fusion
+from scenes import experiment
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -75,17 +79,39 @@ def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(result.summary) == 1
 
 
-def test_own_model_of_the_architecture_page_works() -> None:
+@pytest.fixture
+def architecture(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The Python of the architecture page, as the module `page`."""
     text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    namespace: dict[str, object] = {"__name__": "page"}
-    exec(code, namespace)
-    fading = namespace["Fading"]
+    page = ModuleType("page")
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(code, vars(page))
+    monkeypatch.setitem(sys.modules, "page", page)
+    return page
+
+
+def test_own_model_of_the_architecture_page_works(architecture: ModuleType) -> None:
+    fading = architecture.Fading
     assert isinstance(fading, type)
     assert issubclass(fading, DetectionModel)
     one = np.ones(1)
     look = Look(one * 20, one, one, one, np.zeros(1, dtype=np.int8), one, one, one, one, one)
     assert fading(kind="page:Fading", half_range_m=20.0).probability(look) == pytest.approx(0.5)
+
+
+def test_own_error_model_of_the_architecture_page_works(architecture: ModuleType) -> None:
+    couple = {"detection": {"kind": "page:Fading", "half_range_m": 1e9}}
+    plan = experiment(pems={"sure": [couple | {"error": {"kind": "page:Widening", "sigma_m_per_m": 0.1}}]})
+    log = scenes.oncoming_car()
+    fused = believed(prepare(log, plan), plan, 0)["PEM"].fused
+    rows = np.flatnonzero(fused.valid[0])
+    away_m = 100.0 - 10.0 * fused.captured_s[fused.frame_ix[rows]]  # the car comes at 10 m/s along the x axis
+    assert fused.cov_ee_m2 is not None
+    assert fused.yaw_var_rad2 is not None
+    assert fused.cov_ee_m2[0, rows] == pytest.approx((0.1 * away_m) ** 2)
+    assert fused.yaw_var_rad2[0, rows] == pytest.approx(0.05**2)
+    off_m = (fused.x_m[0, rows] - away_m) / (0.1 * away_m)
+    assert 0.5 < np.std(off_m[away_m > 1]) < 1.5
 
 
 def test_own_fusion_of_the_fusion_page_works() -> None:
@@ -115,5 +141,7 @@ def test_architecture_names_every_file() -> None:
 
 
 def test_decisions_fit_on_a_page() -> None:
-    for path in (ROOT / "docs/decisions").glob("*.md"):
+    pages = sorted((ROOT / "docs/decisions").glob("*.md"))
+    assert [int(path.name[:4]) for path in pages[:17]] == list(range(1, 18))
+    for path in pages:
         assert len(path.read_text(encoding="utf-8").splitlines()) <= 30, path.name

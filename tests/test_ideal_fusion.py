@@ -573,3 +573,12 @@ def test_against_the_words(
                 if math.hypot(east, north) > 1e-3:  # else they point in opposite directions
                     assert math.cos(turned) == pytest.approx(east / math.hypot(east, north), abs=1e-9)
                     assert math.sin(turned) == pytest.approx(north / math.hypot(east, north), abs=1e-9)
+
+
+def test_neither_the_receivers_own_body_nor_what_has_no_truth_id_is_in_the_list() -> None:
+    """Object 2 carries the receiver; −1: an entry of a recorded unit about nobody known."""
+    of = heard({"a": [(0.0, {-1: {}, 1: {}, 2: {}})], "b": [(0.0, {-1: {}, 2: {}, 3: {}})]})
+    (everything,) = issued(of)
+    assert sorted(everything["holds"]) == [1, 2, 3]
+    (others,) = issued(of, without_object_ix=2)
+    assert sorted(others["holds"]) == [1, 3]

@@ -281,8 +281,10 @@ def test_survey_is_quick_and_light(path):
     assert done.stdout == "[]\n"
 
 
-@pytest.mark.parametrize("path", sorted(SHARED.glob("*.mcap")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(SHARED.glob("*.mcap")) or [None], ids=lambda p: p.stem if p else "absent")
 def test_real_recordings_fit_a_screen(path):
+    if path is None:
+        pytest.skip("shared/data with recordings is not beside the project")
     found = survey(path)
     assert found["readable"]
     json.dumps(found, allow_nan=False)

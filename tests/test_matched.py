@@ -371,3 +371,12 @@ def test_little_is_remembered_of_what_is_known() -> None:
     adding.add(lists, matches, np.array(times))
     # Of both runs every tenth capture, as an instant and as a list.
     assert len(adding._held) == 2 * 2 * 19
+
+
+def test_of_equal_entries_about_one_object_the_newer_stands_then_that_of_the_first_unit() -> None:
+    """The match is of before the onset; what else the list holds says since when the object is known, and by whom."""
+    before = Item(7, 0.9, unit_ix=3)
+    newer = [Item(7, 1.2, role=DUPLICATE, unit_ix=k) for k in (2, 1)]
+    older = [Item(7, 1.1, role=DUPLICATE, unit_ix=0)]
+    for order in ([before, *older, *newer], [before, *newer, *older], [*newer[::-1], *older, before]):
+        assert found([order], [1.3], hits=2, of=2, captured_s=[1.1, 1.2])[0] == (1.3, 1.2, 1)

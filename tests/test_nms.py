@@ -236,3 +236,9 @@ def test_a_run_alone_is_the_run_among_others():
         alone = Nms().fuse(reports_of([lists], names, reports.captured_s.tolist(), reports.arrives_s.tolist()))
         for k in range(len(reports.issue_s)):
             assert alone.of(0, k).tobytes() == fused.of(run, k).tobytes()
+
+
+def test_boxes_have_to_share_more_than_fifteen_per_cent_where_nothing_else_is_said():
+    # 4 m × 2 m, d apart lengthwise: (4 − d) / (4 + d) in common, 0.15 at d = 3.4 / 1.15 = 2.9565.
+    for apart_m, count in ((2.95, 1), (2.96, 2)):
+        assert len(kept(Nms(), entry(0.0, existence=0.9), entry(apart_m, existence=0.8))) == count

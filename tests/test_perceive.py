@@ -341,3 +341,28 @@ class TestAddressing:
         first = seen(log, plan)[1].valid
         for other in (seen(renamed, plan)[1].valid, seen(log, plan.model_copy(update={"seed": 8}))[1].valid):
             assert abs((first == other).mean() - 0.5) < 5 * 0.5 / math.sqrt(first.size)
+
+
+class TestEquipped:
+    def test_a_unit_that_a_run_does_not_have_lists_nothing_in_it(self) -> None:
+        log, plan = square(frames=2), two_units(ego=sees(1.0), mast=sees(1.0))
+        found = candidates(log.scene, log.truth, plan)
+        there = np.array([[True, True], [True, False], [False, True], [False, False]])
+        of = perceive(log.scene, found, plan, np.arange(4), equipped=there)
+        for run, (ego, mast) in enumerate(there.tolist()):
+            listed = {of.units[u] for u in of.row_unit_ix[of.valid[run]]}
+            assert listed == {name for name, has in (("ego", ego), ("mast", mast)) if has}
+
+    @pytest.mark.parametrize("states", ["expected", "sampled"])
+    def test_each_unit_states_its_own_covariance(self, states: Literal["expected", "sampled"]) -> None:
+        own, others = [[1.0, 0.3], [0.3, 0.5]], [[4.0, -1.0], [-1.0, 2.0]]
+        plan = two_units(ego=sees(1.0, gaussian(own)), mast=sees(1.0, gaussian(others)))
+        _, of = seen(square(), plan, np.arange(3), states)
+        assert of.cov_ee_m2 is not None
+        assert of.cov_en_m2 is not None
+        assert of.cov_nn_m2 is not None
+        stated = np.stack([of.cov_ee_m2[0], of.cov_en_m2[0], of.cov_nn_m2[0]], axis=1)
+        for unit, expected in ((0, [1.0, 0.3, 0.5]), (1, [4.0, -1.0, 2.0])):
+            rows = np.flatnonzero(of.row_unit_ix == unit)
+            assert len(rows) >= 2
+            assert stated[rows].tolist() == [expected] * len(rows)

@@ -1,7 +1,5 @@
 """Velocities and heights of scenes one can compute in the head."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -95,26 +93,51 @@ def test_stationary_objects_are_left_alone():
     assert notes == []
 
 
-@given(st.lists(st.tuples(st.floats(0.01, 0.9), st.floats(-3, 3), st.sampled_from([NAN, 0.0, 2.0, 500.0]))))
-def test_velocities_against_a_plain_loop(steps):
-    time_s, x_m = np.cumsum([s[0] for s in steps]), np.cumsum([s[1] for s in steps])
-    logged = np.array([s[2] for s in steps])
-    n = len(steps)
-    cut = n // 3
-    start = np.array([0, cut, n] if cut else [0, n])
-    zero = np.zeros(n)
-    vx, _, _ = velocities(start, time_s, x_m, zero, logged, zero, np.ones(n, dtype=bool))
-    for first, last in pairwise(start):
-        for k in range(first, last):
-            lo = k - 1 if k > first and time_s[k] - time_s[k - 1] <= 0.5 else k
-            hi = k + 1 if k + 1 < last and time_s[k + 1] - time_s[k] <= 0.5 else k
-            sides = [(x_m[b] - x_m[a]) / (time_s[b] - time_s[a]) for a, b in ((lo, k), (k, hi)) if a != b]
-            frozen = logged[k] == 0 and sides and min(abs(s) for s in sides) > 0.5
-            wrong = not logged[k] <= 100  # NaN is not
-            derived = (x_m[hi] - x_m[lo]) / (time_s[hi] - time_s[lo]) if lo != hi else 0.0
-            borderline = any(abs(abs(s) - 0.5) < 1e-9 for s in sides)
-            if not borderline:
-                assert vx[k] == pytest.approx(derived if wrong or frozen else logged[k], abs=1e-9)
+STEPS = st.lists(st.floats(0.01, 0.45), min_size=1, max_size=12)
+LOGGED = st.sampled_from([NAN, 0.0, 2.0, 500.0])
+
+
+@given(STEPS, st.floats(-100, 100), st.floats(-30, 30), st.floats(-5, 5))
+def test_of_what_accelerates_evenly_it_is_the_speed_half_way_between_the_neighbours(steps, x0, v0, a):
+    # A chord of x₀ + v₀ t + a t² / 2 is as steep as the curve half way between its ends, however long it is.
+    time_s = np.cumsum([0.0, *steps])
+    vx, _ = along_x(time_s, x0 + v0 * time_s + a / 2 * time_s**2, np.full(len(time_s), NAN))
+    half_way_s = (np.append(time_s[1:], time_s[-1]) + np.insert(time_s[:-1], 0, time_s[0])) / 2
+    assert vx == pytest.approx((v0 + a * half_way_s).tolist(), abs=1e-6)
+
+
+TRACK = st.lists(st.tuples(st.floats(0.01, 0.9), st.floats(-3, 3), LOGGED), min_size=1, max_size=10)
+
+
+def of_steps(steps):
+    """Times, places and logged velocities."""
+    time_s, x_m = np.cumsum([step[:2] for step in steps], axis=0).T
+    return time_s, x_m, np.array([step[2] for step in steps])
+
+
+@given(TRACK)
+def test_a_velocity_that_may_be_true_is_kept_and_no_impossible_one_is(steps):
+    time_s, x_m, logged = of_steps(steps)
+    vx, _ = along_x(time_s, x_m, logged)
+    assert [v for v, given in zip(vx, logged, strict=True) if given == 2.0] == [2.0] * int((logged == 2.0).sum())
+    assert np.isfinite(vx).all()
+    assert 500.0 not in vx
+
+
+@given(TRACK, TRACK)
+def test_tracks_have_nothing_to_do_with_each_other(one, other):
+    alone = [along_x(*of_steps(steps))[0] for steps in (one, other)]
+    time_s, x_m, logged = (np.concatenate(columns) for columns in zip(of_steps(one), of_steps(other), strict=True))
+    together, _ = along_x(time_s, x_m, logged, start=[0, len(one), len(one) + len(other)])
+    assert together == alone[0] + alone[1]
+
+
+@given(TRACK)
+def test_backwards_in_time_everything_moves_the_other_way(steps):
+    time_s, x_m, logged = of_steps(steps)
+    forwards, _ = along_x(time_s, x_m, logged)
+    backwards, _ = along_x(-time_s[::-1], x_m[::-1], -logged[::-1])
+    assert backwards[::-1] == pytest.approx([-v for v in forwards], abs=1e-9)
 
 
 # ------------------------------------------------------------------------------- heights

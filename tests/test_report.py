@@ -8,6 +8,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -204,6 +205,19 @@ class TestWords:
             r"No difference to it can be shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3]
         )
         assert lines[3].endswith("]). That is not to say that there is none.")
+
+    @pytest.mark.parametrize(
+        ("low", "high", "includes"), [(-1.0, 0.0, True), (0.0, 1.0, True), (-1.0, -1e-3, False), (1e-3, 1.0, False)]
+    )
+    def test_an_interval_that_ends_at_0_includes_it(self, made: Path, low: float, high: float, includes: bool) -> None:
+        study = load_study(made, "GT")
+        assert study.regret is not None
+        table = study.regret.table.copy()
+        mine = (table["metric"] == "ttd_rmst_s") & (table["configuration"] == study.best)
+        table.loc[mine, ["low", "high"]] = [low, high]
+        changed_one = replace(study, regret=replace(study.regret, table=table))
+        (line,) = [line for line in Page(page(changed_one)).lines() if line.startswith("half against GT, the baseline")]
+        assert ("the interval includes 0, so no difference can be shown" in line) == includes
 
     def test_one_configuration_is_compared_with_nothing(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(ONE, *ALONE))

@@ -277,3 +277,20 @@ def test_against_the_oracle(seen: dict[int, list[Sighting]], data: st.DataObject
         assert there[k] == (known is not None)
         if known is not None:
             same({name: float(column[k]) for name, column in columns.items()}, known)
+
+
+@pytest.mark.parametrize("asked", [None, [0, 100, 200, 300]])
+def test_a_frame_that_one_object_misses_is_filled_at_the_truths_own_instants(asked: list[int] | None) -> None:
+    """Object 1 is not in the frame of 100 ms, in which object 2 is: it was half way, and so it is there."""
+    world = truth(
+        {
+            1: [sighting(0, x_m=0.0), sighting(200 * MS, x_m=2.0), sighting(300 * MS, x_m=3.0)],
+            2: [sighting(k * 100 * MS, x_m=50.0) for k in range(4)],
+        }
+    )
+    instants = world.stamp_ns if asked is None else T0_NS + np.array(asked) * MS
+    found = at_instants(world, instants, t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    rows = found.row_object_ix == 1
+    assert found.frame_ix[rows].tolist() == [0, 1, 2, 3]
+    assert found.x_m[0, rows] == pytest.approx([0, 1, 2, 3])
+    assert (found.row_object_ix == 2).sum() == 4

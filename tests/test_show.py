@@ -341,6 +341,16 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
     assert line == [[0.0, 0.0, 0.0], [60.0, 0.0, 0.0]]
 
 
+@pytest.mark.parametrize(("many", "lines"), [(3, True), (4, False)])
+def test_up_to_three_marks_have_lines_and_words(tmp_path: Path, many: int, lines: bool) -> None:
+    walkers = [Thing(f"w{k}", "pedestrian", standing(20 + k, 8 * k)) for k in range(many)]
+    scene = recording([Thing("ego", "car", standing(0, 0)), *walkers], until_s=0.5)
+    path = make(tmp_path / "x.rrd", scene).path
+    assert len(at(path, "/world/PEM/marks/from", 0.5)["Points3D:labels"]) == many
+    assert static(path, "/world/PEM/marks/from")["Points3D:show_labels"] == [lines]
+    assert bool(rows(path, "/world/PEM/marks/from/line")) == lines
+
+
 def test_detected_before_the_onset_and_where_nobody_knows(made: Made, tmp_path: Path) -> None:
     table = made.table[made.table["detected"]].head(1).assign(
         detection_s=0.5, onset_s=1.0, time_to_detection_s=-0.5, distance_at_detection_m=np.nan

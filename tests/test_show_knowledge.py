@@ -294,6 +294,28 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     assert CAPTURED not in made.status
 
 
+@pytest.mark.parametrize("arrives", [False, True])
+def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hiding: Made, arrives: bool) -> None:
+    """Two lists of the pole hold pedestrian 4, at 0 and 0.1 s, the next ones do not; no fused list ever does."""
+    from dataclasses import replace
+
+    from copem_replay.show.sight import sight
+    from copem_replay.show.status import LOST, UNMATCHED, VISIBLE, status_of
+
+    belief, number = hiding.beliefs["both"], hiding.replay.scene.object_number["4"]
+    heard = belief.heard
+    late = heard.captured_s[heard.frame_ix] > 0.15
+    heard = replace(heard, valid=heard.valid & ~(late & (heard.row_object_ix == number)))
+    if not arrives:
+        heard = replace(heard, arrives_s=np.full_like(heard.arrives_s, np.inf))
+    nothing = replace(belief.fused, valid=np.zeros_like(belief.fused.valid))
+    seen = sight(hiding.replay, hiding.given, [number])
+    made = status_of(hiding.replay, hiding.given, "both", replace(belief, heard=heard, fused=nothing), seen)
+    early = made.elapsed_ns < 199_000_000
+    assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}
+    assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[VISIBLE]}
+
+
 def test_nothing_that_is_written_is_nan(hiding: Made) -> None:
     from rerun.chunk import RrdReader
 

@@ -111,6 +111,19 @@ def test_a_censored_one_counts_as_looked_at_at_that_very_time():
     assert incidence.tolist() == [0.25, 0.625, 1.0]
 
 
+@pytest.mark.parametrize(("least", "expected"), [(0.5, 1.0), (0.5 + 1e-6, 0.5)])
+def test_what_is_no_share_of_all_takes_no_weight_over(least: float, expected: float):
+    # One of two is censored at 1: to the other, half of all, goes its weight where half is enough to be somebody.
+    _, incidence = cumulative_incidence(np.array([1.0, 2.0]), np.array([CENSORED, DETECTED]), least=least)
+    assert incidence.tolist() == [expected]
+
+
+@pytest.mark.parametrize(("rest", "expected"), [(1e-9, 1.0), (1e-15, 1e-15)])
+def test_next_to_nothing_is_nobody(rest: float, expected: float):
+    _, incidence = cumulative_incidence(np.array([1.0, 2.0]), np.array([CENSORED, DETECTED]), np.array([1.0, rest]))
+    assert incidence == pytest.approx([expected], rel=1e-6)
+
+
 def test_detection_and_departure_at_one_instant_share_the_risk_of_that_instant():
     _, incidence = cumulative_incidence(np.array([1.0, 1.0, 1.0]), np.array([LEFT, DETECTED, DETECTED]))
     assert incidence.tolist() == [2 / 3]

@@ -757,3 +757,11 @@ def test_settings_by_default():
 def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]):
     with pytest.raises(ValidationError):
         Tracker(**settings)
+
+
+@pytest.mark.parametrize("late", LATE)
+def test_published_is_what_is_claimed_above_the_threshold(late: str):
+    # Looked at when it was said, nothing has faded: 1 − (1 − 0.5) is exactly a half.
+    for claimed, count in ((0.5, 0), (0.5 + 1e-12, 1)):
+        reports = reports_of([[entry(0.0, existence=claimed)]], ["a"], [0.0], [0.0])
+        assert len(fuse_one(reports, late=late, publish=0.5, **AT_ONCE)[0]) == count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -240,3 +241,18 @@ def test_who_hides_whom() -> None:
     )
     house = statics([np.array([(-5, 10), (5, 10), (5, 12), (-5, 12)])], [0.0], [9.0])
     assert hidden_by(world, house, at((0, 0, 1)), flat=False)[0].tolist() == [2, -1, 1, -2, -1]
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_wall_from_far_behind_to_the_front_hides_what_is_ahead(side: int) -> None:
+    """Half a metre beside the eyes, from 100 m behind to 10 m ahead, where it leaves 0.05 of slope to its side.
+
+    Of what is 20 m ahead, from 7 m on the other side to 3 m on its own, all is seen to where the wall begins. Its own
+    middle is behind, on the other side of the line that azimuths are counted from.
+    """
+    world = one_list([(20, -2 * side, 0, 0.001, 10, 0, 2), (-45, side, 0, 110, 1, 0, 9)])
+    seen, wall = shares(world, (0, 0, 1), flat=True)
+    free, hidden = math.atan(7 / 20) + math.atan(0.05), math.atan(3 / 20) - math.atan(0.05)
+    assert seen == pytest.approx(free / (free + hidden), abs=1e-3)
+    assert wall == 1
+    assert hidden_by(world, NO_STATICS, at((0, 0, 1)), flat=True)[0].tolist() == [1, -1]

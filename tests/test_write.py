@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +21,17 @@ from mcap.writer import Writer
 from osi3.osi_sensordata_pb2 import SensorData
 
 from copem_replay.check import problems, read_logs
+from copem_replay.colours import configuration_colours
 from copem_replay.errors import OutputError, RecordingError
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, log_paths
 from copem_replay.families import family_of
-from copem_replay.formats import sensor_data
+from copem_replay.formats import detail, sensor_data
 from copem_replay.fusion.belief import Belief
 from copem_replay.lists import read_lists
 from copem_replay.read import read
 from copem_replay.replay import Replay, believed, prepare, replay_block
-from copem_replay.tracks import UNCERTAINTIES, VALUES
+from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES
 from copem_replay.write import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
 
 ROOT = Path(__file__).parents[1]
@@ -119,6 +122,12 @@ def test_sensor_data_says_what_was_believed(written: Written, configuration: str
     fused = belief.fused
     lists = [m for m in messages(written.path) if m[0] == f"copem/{configuration}/objects"]
     assert len(lists) == len(fused.stamp_ns)
+
+    def sigma(name: str, row: int) -> float:
+        variance = getattr(fused, name)
+        assert variance is not None
+        return math.sqrt(variance[0, row])
+
     units = {int(k[5:]): v for k, v in metadata(written.path)[RUN_RECORD].items() if k.startswith("unit.")}
     seen = 0
     for frame, (_topic, log_time, publish_time, _sequence, payload) in enumerate(lists):
@@ -145,8 +154,13 @@ def test_sensor_data_says_what_was_believed(written: Written, configuration: str
             assert base.dimension.length == fused.length_m[0, p]
             assert base.dimension.width == fused.width_m[0, p]
             assert base.dimension.height == fused.height_m[0, p]
-            assert fused.cov_ee_m2 is not None
-            assert spread.position.x == pytest.approx(np.sqrt(fused.cov_ee_m2[0, p]))
+            assert (spread.position.x, spread.position.y) == (sigma("cov_ee_m2", p), sigma("cov_nn_m2", p))
+            assert spread.orientation.yaw == sigma("yaw_var_rad2", p)
+            size = spread.dimension
+            assert (size.length, size.width, size.height) == (sigma("size_var_m2", p),) * 3
+            if scene.moving[fused.row_object_ix[p]]:
+                assert (base.velocity.x, base.velocity.y) == (fused.vx_mps[0, p], fused.vy_mps[0, p])
+                assert (spread.velocity.x, spread.velocity.y) == (sigma("speed_var_m2ps2", p),) * 2
             assert item.header.existence_probability == 1
             entries = belief.entries[belief.start[p] : belief.start[p + 1]]
             behind = [k for k in entries if belief.heard.valid[0, k]]
@@ -158,8 +172,17 @@ def test_sensor_data_says_what_was_believed(written: Written, configuration: str
     assert seen > 100
 
 
+def test_ids_beyond_64_bits_are_hashed() -> None:
+    assert sensor_data.osi_id("18446744073709551615") == 2**64 - 1
+    assert sensor_data.osi_id("stationary:7") == 7
+    assert 0 <= sensor_data.osi_id("18446744073709551616") < 2**64
+    assert sensor_data.osi_id("18446744073709551616") != sensor_data.osi_id("18446744073709551617")
+
+
 def test_scene_updates_draw_each_list_anew(written: Written) -> None:
     fused, scene = written.beliefs["PEM"].fused, written.replay.scene
+    colour = configuration_colours(written.beliefs)["PEM"]
+    assert max(colour) > 100
     updates = [m for m in messages(written.path) if m[0] == "copem/PEM/scene"]
     assert len(updates) == len(fused.stamp_ns)
     for frame, (_topic, log_time, _publish, _sequence, payload) in enumerate(updates):
@@ -173,6 +196,9 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
             entity = by_id[scene.object_ids[fused.row_object_ix[p]]]
             assert (entity.frame_id, entity.timestamp.ToNanoseconds()) == ("global", log_time)
             (cube,) = entity.cubes
+            # Colours are shares of 1, and what is inside of a box stays visible.
+            assert (cube.color.r, cube.color.g, cube.color.b) == tuple(shade / 255 for shade in colour)
+            assert cube.color.a == 0.5
             assert (cube.pose.position.x, cube.pose.position.y) == (fused.x_m[0, p], fused.y_m[0, p])
             assert (cube.size.x, cube.size.y, cube.size.z) == (
                 fused.length_m[0, p], fused.width_m[0, p], fused.height_m[0, p],
@@ -182,7 +208,6 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
 
 
 def test_details_tell_entries_and_detections(written: Written) -> None:
-    belief = written.beliefs["mixed"]
     details = [json.loads(m[4]) for m in messages(written.path) if m[0] == "copem/mixed/detail"]
     events = [(d["available_ns"], e) for d in details for e in d["events"]]
     row = written.table[(written.table["configuration"] == "mixed") & written.table["detected"]].iloc[0]
@@ -191,12 +216,41 @@ def test_details_tell_entries_and_detections(written: Written) -> None:
     assert event["object"] == row["object_id"]
     assert event["first_unit"] == row["first_unit"]
     assert event["time_to_detection_s"] == row["time_to_detection_s"]
-    entries = sum(len(o["units"]) for d in details for o in d["objects"])
-    used = [k for k in belief.entries if belief.heard.valid[0, k]]
-    assert entries == len(used)
-    shares = [share for d in details for o in d["objects"] for share in o["visible_share"]]
-    assert belief.look is not None
-    assert sorted(shares) == sorted(belief.look.visible_share[used].tolist())
+
+
+def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
+    """Object by object in the order of the list: what it was made of, and its variances."""
+    belief, scene = written.beliefs["mixed"], written.replay.scene
+    fused, heard, look = belief.fused, belief.heard, belief.look
+    assert look is not None
+    contents = [json.loads(m[4]) for m in messages(written.path) if m[0] == "copem/mixed/detail"]
+    assert len(contents) == len(fused.stamp_ns)
+    several = 0
+    for frame, content in enumerate(contents):
+        rows = [p for p in np.flatnonzero(fused.frame_ix == frame) if fused.valid[0, p]]
+        assert content["captured_ns"] == fused.stamp_ns[frame]
+        assert content["available_ns"] == scene.t0_ns + round(fused.arrives_s[0, frame] * 1e9)
+        assert sorted(one["id"] for one in content["objects"]) == sorted(
+            scene.object_ids[fused.row_object_ix[p]] for p in rows
+        )
+        for one in content["objects"]:
+            (p,) = [p for p in rows if scene.object_ids[fused.row_object_ix[p]] == one["id"]]
+            used = [k for k in belief.entries[belief.start[p] : belief.start[p + 1]] if heard.valid[0, k]]
+            several += len(used) > 1
+            assert one["units"] == [heard.units[heard.row_unit_ix[k]] for k in used]
+            assert one["captured_ns"] == [heard.stamp_ns[heard.frame_ix[k]] for k in used]
+            assert one["range_m"] == [look.range_m[k] for k in used]
+            assert one["visible_share"] == [look.visible_share[k] for k in used]
+            assert [one[name] for name in UNCERTAINTIES] == [getattr(fused, name)[0, p] for name in UNCERTAINTIES]
+    assert several > 100
+
+
+def test_a_list_of_nothing_was_captured_never(written: Written) -> None:
+    belief = written.beliefs["PEM"]
+    never = np.full(len(belief.fused.stamp_ns), NO_CAPTURE_NS)
+    silent = replace(belief.fused, stamp_ns=never, valid=np.zeros_like(belief.fused.valid))
+    writer = detail.DetailWriter(written.replay.scene, replace(belief, fused=silent), {})
+    assert json.loads(writer.message(0, 7)) == {"available_ns": 7, "captured_ns": None, "objects": [], "events": []}
 
 
 def test_read_back_as_a_log_it_is_the_input(written: Written) -> None:
@@ -317,6 +371,7 @@ def test_written_into_its_own_output_the_old_lists_are_replaced_and_it_is_said(
 ) -> None:
     notes = written.write(tmp_path / "twice.mcap", source=written.path)
     assert any("earlier replay" in note for note in notes)
+    assert metadata(tmp_path / "twice.mcap") == metadata(written.path)  # no record twice
     assert messages(tmp_path / "twice.mcap") == messages(written.path)
 
 
@@ -350,6 +405,44 @@ def test_metadata_attachments_and_foreign_channels_are_kept(written: Written, tm
     assert summary is not None
     assert [c.topic for c in summary.channels.values() if not c.topic.startswith("copem/")].count("their/topic") == 1
     assert any(c.topic == "silent" for c in summary.channels.values())
+
+
+def rich(path: Path) -> None:
+    """Two channels of one topic, told apart by their metadata alone; an attachment twice; a record in two parts."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="mine", library="other")
+        schema = writer.register_schema("their.Schema", "jsonschema", b"{}")
+        writer.add_metadata("their.record", {"first": "1", "both": "early"})
+        writer.add_metadata("other.record", {"k": "v"})
+        writer.add_metadata("their.record", {"second": "2", "both": "late"})
+        for _ in range(2):
+            writer.add_attachment(1, 2, "calibration.txt", "text/plain", b"data")
+        writer.add_attachment(1, 2, "calibration.txt", "text/plain", b"other data")
+        for k, frame in enumerate(("left", "right")):
+            channel = writer.register_channel("their/topic", "json", schema, {"frame": frame})
+            writer.add_message(channel, k, frame.encode(), k)
+        writer.finish()
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_what_differs_in_metadata_alone_stays_apart_and_what_belongs_together_is_one(
+    written: Written, tmp_path: Path, indexed: bool
+) -> None:
+    source, out = tmp_path / "rich.mcap", tmp_path / "out.mcap"
+    rich(source)
+    if not indexed:  # read from its start
+        source.write_bytes(source.read_bytes()[:-40])
+    written.write(out, source=source)
+    with out.open("rb") as file:
+        reader = make_reader(file)
+        theirs = [(c.metadata, m.data) for _, c, m in reader.iter_messages() if c.topic == "their/topic"]
+        attached = [a.data for a in reader.iter_attachments()]
+    assert theirs == [({"frame": "left"}, b"left"), ({"frame": "right"}, b"right")]
+    assert sorted(attached) == [b"data", b"other data"]
+    records = metadata(out)
+    assert records["their.record"] == {"first": "1", "second": "2", "both": "late"}
+    assert records["other.record"] == {"k": "v"}
 
 
 def test_a_damaged_recording_is_copied_as_far_as_it_goes(written: Written, tmp_path: Path) -> None:

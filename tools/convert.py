@@ -1,25 +1,31 @@
 """Convert a data set or a simulation to OSI truth that copem-replay reads.
 
     python tools/convert.py FORMAT INPUT OUTPUT.mcap [options]
+    python tools/convert.py scenarionet FOLDER FOLDER [options]
 
 Formats: argoverse2, scenarionet, openlabel, commonroad, sumo, csv (docs/converters.md). Prints what was converted,
 skipped and assumed. Ends 0, or 2 with one line on what is wrong with the input; the output is there in full or not at
-all, and the same input gives the same bytes.
+all, and the same input gives the same bytes. What is there already is replaced with `--overwrite` only.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
 from converters import argoverse2, commonroad, csv_rows, openlabel, scenarionet, sumo
 from converters.parse import number, positive
+from converters.scenario_folder import scenarios
 from converters.trace import RECORD, Frame, Report, write
 from copem_replay.errors import InputError
 from copem_replay.wording import counted
+
+_MOST_LINES = 10
+"""Of one kind that are printed (chosen): a data set has thousands of scenarios."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -47,10 +53,11 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="convert.py", description="Convert a data set or a simulation to OSI truth (MCAP).")
     formats = top.add_subparsers(dest="format", metavar="FORMAT", required=True)
 
-    def add(name: str, what: str, given: str) -> argparse.ArgumentParser:
+    def add(name: str, what: str, given: str, written: str | None = None) -> argparse.ArgumentParser:
         one = formats.add_parser(name, help=what, description=what)
         one.add_argument("input", type=Path, metavar="INPUT", help=given)
-        one.add_argument("output", type=Path, metavar="OUTPUT.mcap")
+        one.add_argument("output", type=Path, metavar="OUTPUT.mcap", help=written)
+        one.add_argument("--overwrite", action="store_true", help="replace a recording that is there already")
         return one
 
     av2 = add("argoverse2", "Argoverse 2 sensor log.", "folder of a log, with annotations.feather")
@@ -70,7 +77,12 @@ def parser() -> argparse.ArgumentParser:
         default=argoverse2.CENTRE_FROM_REAR_AXLE_M,
         help="centre of the ego's box from its rear axle (default: %(default)s)",
     )
-    net = add("scenarionet", "ScenarioNet description of nuScenes and others.", "pickle")
+    net = add(
+        "scenarionet",
+        "ScenarioNet descriptions of nuScenes, Waymo and others.",
+        "pickle, or a folder of them: of a data set",
+        "of a folder: another folder",
+    )
     net.add_argument(
         "--ego-centre-m",
         type=_finite,
@@ -91,58 +103,102 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def frames(given: argparse.Namespace, report: Report) -> Iterator[Frame]:
+def frames(given: argparse.Namespace, source: Path, report: Report) -> Iterator[Frame]:
     """Frames of the input, by the format."""
     match given.format:
         case "argoverse2":
             return argoverse2.frames(
-                given.input,
+                source,
                 report,
                 ego_size_m=tuple(given.ego_size_m),
                 centre_from_rear_axle_m=tuple(given.centre_from_rear_axle_m),
             )
         case "scenarionet":
-            return scenarionet.frames(given.input, report, ego_centre_m=given.ego_centre_m)
+            return scenarionet.frames(source, report, ego_centre_m=given.ego_centre_m)
         case "openlabel":
-            return openlabel.frames(
-                given.input, report, rate_hz=given.rate_hz, source=given.source, target=given.target
-            )
+            return openlabel.frames(source, report, rate_hz=given.rate_hz, source=given.source, target=given.target)
         case "commonroad":
-            return commonroad.frames(given.input, report)
+            return commonroad.frames(source, report)
         case "sumo":
-            return sumo.frames(given.input, report, type_files=given.types, host=given.host)
+            return sumo.frames(source, report, type_files=given.types, host=given.host)
         case _:
-            return csv_rows.frames(given.input, report)
+            return csv_rows.frames(source, report)
 
 
-def convert(given: argparse.Namespace) -> Report:
-    """Convert and return what there is to say. Raises InputError, or OSError of the output."""
-    if given.output.suffix != ".mcap":
-        raise InputError(f"{given.output}: expected an output that ends in .mcap, found {given.output.name!r}")
+def convert(given: argparse.Namespace, source: Path, output: Path) -> Report:
+    """Convert one recording and return what there is to say. Raises InputError, or OSError of the output."""
+    report = Report()
+    write(output, frames(given, source, report), report, source=source, format_name=given.format)
+    return report
+
+
+def recordings(given: argparse.Namespace) -> dict[Path, Path]:
+    """The input of each output. Raises InputError: there is no input, or an output is there already."""
     if not given.input.exists():
         raise InputError(f"{given.input}: no such file or folder")
-    report = Report()
-    write(given.output, frames(given, report), report, source=given.input, format_name=given.format)
-    return report
+    if given.format == "scenarionet" and given.input.is_dir():
+        if given.output.suffix == ".mcap" or given.output.is_file():
+            raise InputError(f"{given.output}: expected a folder for the recordings of one, found a file's name")
+        wanted = {given.output / f"{name}.mcap": path for name, path in scenarios(given.input).items()}
+    else:
+        if given.output.suffix != ".mcap":
+            raise InputError(f"{given.output}: expected an output that ends in .mcap, found {given.output.name!r}")
+        wanted = {given.output: given.input}
+    there = [output for output in wanted if output.is_file()]
+    if there and not given.overwrite:
+        more = f", and {counted(len(there) - 1, 'other')}" if len(there) > 1 else ""
+        raise InputError(f"{there[0]}: is there already{more}; give another name, or --overwrite")
+    return wanted
 
 
 def main(words: list[str] | None = None) -> int:
     given = parser().parse_args(words)
+    wrong: list[str] = []
+    notes: Counter[tuple[str, str]] = Counter()
+    assumed: Counter[str] = Counter()
+    numbered, done, wanted = False, 0, dict[Path, Path]()
     try:
-        report = convert(given)
+        wanted = recordings(given)
     except InputError as error:
-        print("\n".join(error.problems), file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"{given.output}: cannot be written: {error.strerror or error}", file=sys.stderr)
-        return 2
-    objects = ", ".join(f"{many} {name}" for name, many in sorted(report.objects.items()))
-    print(f"{given.output}: {counted(report.frames, 'frame')}, {objects}")
-    for line in report.lines():
+        wrong += error.problems
+    for output, source in wanted.items():
+        try:
+            report = convert(given, source, output)
+        except InputError as error:
+            wrong += error.problems
+            continue
+        except OSError as error:
+            wrong.append(f"{output}: cannot be written: {error.strerror or error}")
+            break
+        done += 1
+        objects = ", ".join(f"{many} {name}" for name, many in sorted(report.objects.items()))
+        print(f"{output}: {counted(report.frames, 'frame')}, {objects}")
+        notes += report.counts
+        assumed.update(list(report.assumed))
+        numbered |= any(name != str(ident) for ident, name in report.names.items())
+    _tell(assumed, notes, numbered, len(wanted))
+    _complain(wrong, len(wanted) - done, len(wanted))
+    return 2 if wrong else 0
+
+
+def _tell(assumed: Counter[str], notes: Counter[tuple[str, str]], numbered: bool, recordings: int) -> None:
+    """Print what was skipped, assumed or put right, of all recordings together."""
+    lines = [line if recordings == 1 else f"{line} ({counted(many, 'recording')})" for line, many in assumed.items()]
+    if len(lines) > _MOST_LINES:
+        lines[_MOST_LINES:] = [f"… and {len(lines) - _MOST_LINES} more; the metadata record {RECORD} of each has all"]
+    for line in [*lines, *(f"{counted(many, noun)} {what}" for (noun, what), many in notes.items())]:
         print(f"note: {line}")
-    if any(name != str(ident) for ident, name in report.names.items()):
+    if numbered:
         print(f"note: objects are numbered; the file's metadata record {RECORD} has their names")
-    return 0
+
+
+def _complain(wrong: list[str], left: int, recordings: int) -> None:
+    """Print what is wrong, a line each, and of many recordings how many there are not."""
+    print("\n".join(wrong[:_MOST_LINES]), end="\n" if wrong else "", file=sys.stderr)
+    if len(wrong) > _MOST_LINES:
+        print(f"… and {len(wrong) - _MOST_LINES} more", file=sys.stderr)
+    if wrong and recordings > 1:
+        print(f"{left} of {counted(recordings, 'scenario')} not converted", file=sys.stderr)
 
 
 if __name__ == "__main__":

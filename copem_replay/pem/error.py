@@ -19,7 +19,23 @@ class ErrorModel(Component, ABC):
 
     @abstractmethod
     def perturb(self, look: Look, noise: Noise) -> Errors:
-        """Errors of every row in every run, and their covariance."""
+        """Errors of every candidate row in every run, and how uncertain the unit says its entries are.
+
+        `look` has P rows, one per object and list. `noise(name)` gives (S, P) standard normals, a row of them per run:
+        one name for each independent quantity, the same numbers whenever it is asked for. No other source of chance.
+
+        Returns `Errors`, all finite:
+
+        - `east_m`, `north_m` (S, P): added to the true position, metres easting and northing.
+        - `cov_ee_m2`, `cov_en_m2`, `cov_nn_m2` (P,): the covariance that the unit claims of these, m². The same in all
+          runs. It is not checked against the errors: a model may claim more, or less, than is true.
+        - `yaw_rad` (S, P) and `yaw_var_rad2` (P,): added to the true heading, counter-clockwise.
+        - `size_m` (3, S, P) and `size_var_m2` (P,): added to length, width and height.
+        - `speed_mps` (S, P) and `speed_var_m2ps2` (P,): added to the speed along the track.
+
+        What is left out (None) is exact. Rows that no unit detects in a run are not used. Other types, shapes, NaN and
+        infinity are errors that name the model.
+        """
 
 
 def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str) -> Errors:

@@ -1,60 +1,76 @@
 """Unpickling that builds nothing but containers, numbers, strings and plain numpy arrays.
 
 A pickle is a program: it may call whatever it names. Here it can name a dozen harmless things; the first other
-name stops it, before anything of it is imported. Nor can a few bytes of it ask for gigabytes.
+name stops it, before anything of it is imported. Nor does numpy believe what a pickle says of an array: a type that
+calls bytes references, or a list that is shorter than the shape, reads what is not its own. And a few bytes of a
+pickle cannot ask for gigabytes, neither at once nor by holding one list many times.
 """
 
 from __future__ import annotations
 
 import collections
 import io
+import math
 import pickle
 import pickletools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, SupportsIndex
 
 import numpy as np
-from numpy._core import multiarray, numeric
 
 from copem_replay.errors import InputError
 
+_TIMES: Final = 16
+"""How many times as many numbers and characters as the file has bytes may be made of it (chosen; about 1 is usual)."""
+_DEEPEST: Final = 100
+"""How deep containers may lie in each other (chosen; 6 are usual)."""
+_ORDERS: Final = ("<", ">", "=", "|")
 
-def _encode(text: str, encoding: str = "latin1") -> bytes:
-    """How old pickles spell bytes; no other codec, some of them unpack."""
-    if encoding != "latin1":
-        raise pickle.UnpicklingError(f"bytes as {encoding}")
-    return text.encode("latin1")
-
-
-def _dtype(name: str, align: object = False, copy: object = False) -> np.dtype[Any]:
-    """Plain numbers, strings and references only: no records."""
-    dtype = np.dtype(name, align=bool(align), copy=bool(copy))
-    if dtype.kind not in "biufcSUO" or dtype.names is not None or dtype.subdtype is not None:
-        raise pickle.UnpicklingError(f"an array of {name}")
-    return dtype
+_NDARRAY: Final = object()
+"""Stands for the class of arrays: pickles name it, and may not call it."""
+_KIND: Final = object()
+"""Stands for any type that only says what a defaultdict is made of."""
+_KINDS: Final = ("bool", "dict", "float", "int", "list", "long", "str", "tuple", "unicode")
 
 
-def _reconstruct(kind: type[np.ndarray[Any, Any]], shape: tuple[int, ...], dtype: object) -> np.ndarray[Any, Any]:
-    """Return an empty array, which its state fills: no pickle asks for a larger one."""
-    if kind is not np.ndarray or shape != (0,):
-        raise pickle.UnpicklingError(f"an array of shape {shape} without content")
-    return np.empty(0)
+class _Dtype:
+    """Type of an array: plain numbers, strings and references, no records. Of its state only the byte order counts."""
+
+    __slots__ = ("dtype",)
+
+    def __init__(self, name: str, align: object = False, copy: object = False) -> None:
+        dtype = np.dtype(str(name))
+        if dtype.kind not in "biufcSUO" or dtype.names is not None or dtype.subdtype is not None:
+            raise pickle.UnpicklingError(f"an array of {name}")
+        self.dtype = dtype
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _version, order, *parts = state[:5]
+        if order not in _ORDERS or any(part is not None for part in parts):
+            raise pickle.UnpicklingError(f"an array of {self.dtype} with parts")
+        self.dtype = self.dtype.newbyteorder(order)
 
 
-_SAFE: Final[dict[tuple[str, str], Any]] = {
-    **{(module, kind.__name__): kind for module in ("builtins", "__builtin__") for kind in (set, frozenset, complex)},
-    ("collections", "OrderedDict"): collections.OrderedDict,
-    ("_codecs", "encode"): _encode,
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): _dtype,
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): _reconstruct for core in ("core", "_core")},
-    **{(f"numpy.{core}.multiarray", "scalar"): multiarray.scalar for core in ("core", "_core")},
-    **{
-        (f"numpy.{core}.numeric", "_frombuffer"): numeric._frombuffer  # type: ignore[attr-defined]
-        for core in ("core", "_core")
-    },
-}
-"""By module and name, old and new: they are looked up here, nothing is imported."""
+class _Array(np.ndarray[Any, Any]):
+    """An array whose content is as much as its shape says."""
+
+    take_from: Callable[[int], None]
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:  # type: ignore[override]
+        _version, shape, given, fortran, content = state
+        dtype = _plain(given)
+        if self.shape != (0,) or not all(type(n) is int and n >= 0 for n in shape):
+            raise pickle.UnpicklingError(f"an array of shape {shape}")
+        expected = math.prod(shape) * (1 if dtype.hasobject else dtype.itemsize)
+        if type(content) is not (list if dtype.hasobject else bytes) or len(content) != expected:
+            raise pickle.UnpicklingError(f"an array of shape {shape} with other content")
+        self.take_from(expected)
+        del self.take_from
+        super().__setstate__((1, shape, dtype, bool(fortran), content))
+
+    def __repr__(self) -> str:
+        return repr(self.view(np.ndarray))
 
 
 class _RefusedError(Exception):
@@ -62,11 +78,102 @@ class _RefusedError(Exception):
 
 
 class _Restricted(pickle.Unpickler):
+    """What a pickle may name, by module and name, old and new; nothing is imported."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(io.BytesIO(data))
+        self._left = _TIMES * len(data)
+        self._safe: dict[tuple[str, str], Any] = {
+            ("collections", "OrderedDict"): self._ordered,
+            ("collections", "defaultdict"): self._default,
+            ("_codecs", "encode"): self._encode,
+            ("numpy", "ndarray"): _NDARRAY,
+            ("numpy", "dtype"): self._dtype,
+        }
+        for module in ("builtins", "__builtin__"):
+            self._safe |= {(module, kind): _KIND for kind in _KINDS}
+            self._safe |= {(module, "complex"): self._complex, (module, "bytes"): self._no_bytes}
+            self._safe |= {(module, "set"): self._set, (module, "frozenset"): self._frozenset}
+        for core in ("numpy.core", "numpy._core"):
+            self._safe[f"{core}.multiarray", "_reconstruct"] = self._reconstruct
+            self._safe[f"{core}.multiarray", "scalar"] = self._scalar
+            self._safe[f"{core}.numeric", "_frombuffer"] = self._from_buffer
+
     def find_class(self, module: str, name: str) -> Any:
         try:
-            return _SAFE[module, name]
+            return self._safe[module, name]
         except KeyError:
             raise _RefusedError(f"{module}.{name}") from None
+
+    def _take(self, many: int) -> None:
+        self._left -= many
+        if self._left < 0:
+            raise pickle.UnpicklingError("far more content than it has bytes")
+
+    def _counted(self, items: Any) -> Any:
+        self._take(len(items))
+        return items
+
+    def _set(self, items: Any = ()) -> set[Any]:
+        return set(self._counted(items))
+
+    def _frozenset(self, items: Any = ()) -> frozenset[Any]:
+        return frozenset(self._counted(items))
+
+    def _ordered(self, items: Any = ()) -> dict[Any, Any]:
+        return collections.OrderedDict(self._counted(items))
+
+    def _default(self, factory: object = None) -> dict[Any, Any]:
+        """A plain dict: what it would make of a key that it has not is of no use here, and is not called."""
+        return {}
+
+    def _complex(self, real: float, imag: float) -> complex:
+        return complex(real, imag)
+
+    def _no_bytes(self) -> bytes:
+        """How old pickles spell none."""
+        return b""
+
+    def _encode(self, text: str, encoding: str = "latin1") -> bytes:
+        """How old pickles spell bytes; no other codec, some of them unpack."""
+        if encoding != "latin1":
+            raise pickle.UnpicklingError(f"bytes as {encoding}")
+        return self._counted(text).encode("latin1")
+
+    def _dtype(self, name: str, align: object = False, copy: object = False) -> _Dtype:
+        return _Dtype(name, align, copy)
+
+    def _reconstruct(self, kind: object, shape: tuple[int, ...], dtype: object) -> _Array:
+        """Return an empty array, which its state fills: no pickle asks for a larger one."""
+        if kind is not _NDARRAY or shape != (0,):
+            raise pickle.UnpicklingError(f"an array of shape {shape} without content")
+        array = _Array((0,))
+        array.take_from = self._take
+        return array
+
+    def _scalar(self, dtype: _Dtype, content: bytes) -> Any:
+        kind = _plain(dtype)
+        if kind.hasobject or type(content) is not bytes or len(content) != kind.itemsize:
+            raise pickle.UnpicklingError(f"a number of {kind} with other content")
+        self._take(len(content))
+        return np.frombuffer(content, kind)[0] if kind.itemsize else kind.type()
+
+    def _from_buffer(
+        self, content: bytes | bytearray, dtype: _Dtype, shape: tuple[SupportsIndex, ...], order: Any, axes: Any = None
+    ) -> Any:
+        """Return an array over bytes, which it does not copy."""
+        if type(content) not in (bytes, bytearray):
+            raise pickle.UnpicklingError("an array over something else than bytes")
+        flat = np.frombuffer(content, _plain(dtype))
+        if order == "K" and axes is not None:
+            return flat.reshape(shape, order="C").transpose(axes)
+        return flat.reshape(shape, order=order)
+
+
+def _plain(dtype: _Dtype) -> np.dtype[Any]:
+    if type(dtype) is not _Dtype:
+        raise pickle.UnpicklingError("an array without a type")
+    return dtype.dtype
 
 
 def _check_memo(data: bytes) -> None:
@@ -76,12 +183,32 @@ def _check_memo(data: bytes) -> None:
             raise pickle.UnpicklingError(f"a memo of {argument} places")
 
 
+def _unfolded(thing: Any, known: dict[int, int], depth: int = 0) -> int:
+    """How much it is to whom looks at all of it: what is held twice counts twice. Raises UnpicklingError: a circle."""
+    if isinstance(thing, str | bytes | bytearray):
+        return 1 + len(thing)
+    if isinstance(thing, np.ndarray) and not thing.dtype.hasobject:
+        return 1 + thing.size
+    if not isinstance(thing, dict | list | tuple | set | frozenset | np.ndarray):
+        return 1
+    if id(thing) not in known:
+        if depth == _DEEPEST:
+            raise pickle.UnpicklingError(f"containers in each other, more than {_DEEPEST} deep")
+        items = (*thing.keys(), *thing.values()) if isinstance(thing, dict) else thing
+        flat = items.flat if isinstance(items, np.ndarray) else items
+        known[id(thing)] = 1 + sum(_unfolded(item, known, depth + 1) for item in flat)
+    return known[id(thing)]
+
+
 def load(path: Path) -> Any:
     """Return what the file holds. Raises InputError: it names anything else, or is no pickle."""
     try:
         data = path.read_bytes()
         _check_memo(data)
-        return _Restricted(io.BytesIO(data)).load()
+        found = _Restricted(data).load()
+        if _unfolded(found, {}) > _TIMES * len(data):
+            raise pickle.UnpicklingError("far more content than it has bytes")
+        return found
     except OSError as error:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
     except _RefusedError as error:

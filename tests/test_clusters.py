@@ -1,0 +1,34 @@
+"""What is resampled whole: logs where there are enough, else objects, and the runs of a lone object."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+from copem_replay.summary import clusters
+
+
+def rows(logs: int, objects: int, runs: int = 2) -> pd.DataFrame:
+    """Objects of the same names in every log."""
+    found = [(f"log {a}", str(b), run) for a in range(logs) for b in range(objects) for run in range(runs)]
+    return pd.DataFrame(found, columns=["log", "object_id", "run"])
+
+
+@pytest.mark.parametrize(
+    ("logs", "objects", "over", "many"),
+    [
+        (1, 1, "runs", 2),
+        (2, 1, None, 2),
+        (4, 1, None, 4),
+        (2, 2, None, 4),  # objects of one name in two logs are two
+        (1, 5, "objects", 5),
+        (4, 2, "objects", 8),
+        (5, 1, "logs", 5),
+        (5, 9, "logs", 5),
+    ],
+)
+def test_what_is_resampled(logs: int, objects: int, over: str | None, many: int) -> None:
+    found, cluster = clusters(rows(logs, objects))
+    assert found == over
+    assert cluster.nunique() == many
+    assert len(cluster) == logs * objects * 2
