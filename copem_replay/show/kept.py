@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -92,7 +93,7 @@ def _joined(pieces: _Pieces) -> Belief:
 
 def _one_after_another(fused: Sequence[Tracks]) -> tuple[Tracks, Int]:
     """Lists of stretches as the lists of one, and where its rows come from, as of `spliced`."""
-    frames = {
+    frames: dict[str, Any] = {
         name: np.concatenate([getattr(piece, name) for piece in fused], axis=-1)
         for name in ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -75,12 +76,11 @@ def write_rrd(
             if baseline is not None:  # of all objects at once: such a log is not long
                 kept = {name: first[name] for name in colours}
                 differences.differences(out, replay, experiment, kept, table[of_chosen], baseline, shown, colours)
-            told, stretch = Kept(shown), first
-            del first
-            while stretch is not None:
+            told, of_stretch = Kept(shown), chain(iter([first]), rest)
+            del first  # one stretch's is held at a time
+            for stretch in of_stretch:
                 _believed(out, replay, experiment, stretch, shown, colours)
                 told.add({name: stretch[name] for name in colours})
-                stretch = next(rest, None)
             _knowledge(out, replay, experiment, told.whole(), shown, colours)
     finally:
         rr.set_strict_mode(strict)
