@@ -5,8 +5,9 @@ Nothing here depends on the run, on a model's parameters or on a configuration: 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,27 @@ class Candidates:
         return np.asarray(met)
 
 
+class KeptShares:
+    """Visible shares of stretches of a log, by far what takes longest of their candidates and least to keep.
+
+    Kept as long as there is room: a number of each row, where the rows themselves would be forty.
+    """
+
+    def __init__(self, room_bytes: int = 256_000_000) -> None:
+        self._room_bytes = room_bytes
+        self._kept: dict[tuple[object, ...], Float] = {}
+
+    def of(self, key: tuple[object, ...], made: Callable[[], Float]) -> Float:
+        """What was made for this key before, else what is made now."""
+        found = self._kept.get(key)
+        if found is None:
+            found = made()
+            if found.nbytes <= self._room_bytes:
+                self._room_bytes -= found.nbytes
+                self._kept[key] = found
+        return found
+
+
 def joined_stretches(pieces: Sequence[Candidates]) -> Candidates:
     """Rows of stretches that follow each other, as of one."""
     if len(pieces) == 1:
@@ -80,11 +102,12 @@ def candidates(
     *,
     from_s: float = -np.inf,
     until_s: float = np.inf,
+    kept: KeptShares | None = None,
 ) -> Candidates:
     """All candidate rows of an experiment's units over one log (`truth`: the world at its own frames).
 
     Of a stretch only the rows captured from an instant on and before another; lists are always all there. `placed`:
-    where the units are, None: to be found out.
+    where the units are, None: to be found out. `kept`: of the same log and units.
     """
     if placed is None:
         placed = place(scene, truth, experiment)
@@ -93,7 +116,9 @@ def candidates(
         places = [placed.poses[name] for name in names]
         carriers = np.array([placed.carrier_ix[name] for name in names])
         flat = experiment.visibility == "flat"
-        shares = visible_shares(world, placed.static, observers(places, carriers), flat=flat)
+        watching = observers(places, carriers)
+        seen = partial(visible_shares, world, placed.static, watching, flat=flat)
+        shares = seen() if kept is None else kept.of((names[0], from_s, until_s), seen)
         for k, name in enumerate(names):
             pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
     ordered = [pieces[name] for name in experiment.modelled]

@@ -16,7 +16,7 @@ from copem_replay.believe import Believed, Receivers, World, by_truth, listen, s
 from copem_replay.braking.course import EgoCourse
 from copem_replay.braking.encounter import Encounter, encounters
 from copem_replay.braking.verdict import passing
-from copem_replay.candidates import Candidates, candidates, joined_stretches
+from copem_replay.candidates import Candidates, KeptShares, candidates, joined_stretches
 from copem_replay.detect import detect
 from copem_replay.errors import ExperimentError
 from copem_replay.experiment import Experiment
@@ -31,7 +31,7 @@ from copem_replay.read import Recording
 from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
 from copem_replay.sight import first_sights, in_sight_s
-from copem_replay.stretches import ROWS_A_STRETCH, WHOLE, Reach, Stretch, stretches
+from copem_replay.stretches import ROWS_A_STRETCH, ROWS_HELD, WHOLE, Reach, Stretch, candidate_rows, stretches
 from copem_replay.tracks import Bool, Float, Int, Scene, Tracks, spliced
 from copem_replay.units import Placed, place
 
@@ -98,6 +98,10 @@ class Replay:
         return Surroundings(self.scene, self.truth, self.fleet.experiment)
 
     @cached_property
+    def _shares(self) -> KeptShares:
+        return KeptShares()
+
+    @cached_property
     def _whole(self) -> Candidates:
         return candidates(self.scene, self.truth, self.fleet.experiment, self.placed)
 
@@ -121,6 +125,7 @@ class Replay:
             self.placed,
             from_s=stretch.from_s if from_s is None else from_s,
             until_s=stretch.until_s,
+            kept=self._shares,
         )
 
     def world(self, experiment: Experiment) -> World:
@@ -139,7 +144,7 @@ class Replay:
             units, {name: listen(seen, lists.truth, units, c, there) for name, c in units.configurations.items()}
         )
         for stretch in self.stretches:
-            earliest_s = reach.earliest_s(stretch.from_s)
+            earliest_s = reach.earliest_s(stretch)
             found = self.found(stretch, earliest_s)
             yield World(
                 self.scene,
@@ -378,9 +383,12 @@ class Beliefs:
 
     def whole(self) -> dict[str, Belief]:
         """All of it at once. Raises ExperimentError where that is too much."""
-        if len(self.replay.stretches) > 1:
-            raise ExperimentError(f"{self.replay.scene.log}: too long to be held at once; take a window of it")
-        return self._all
+        replay = self.replay
+        if len(replay.stretches) == 1:
+            return self._all
+        if candidate_rows(replay.scene, replay.truth, replay.fleet.experiment) > ROWS_HELD:
+            raise ExperimentError(f"{replay.scene.log}: too long to be held at once; take a window of it")
+        return replace(self, replay=replace(replay, stretches=(WHOLE,))).whole()
 
     @cached_property
     def _all(self) -> dict[str, Belief]:

@@ -15,14 +15,17 @@ import numpy as np
 
 from copem_replay.experiment import Configuration, Experiment
 from copem_replay.fusion.component import ListFusion
+from copem_replay.fusion.instants import instants
 from copem_replay.resample import AROUND_S
 from copem_replay.tracks import Float, Scene, Tracks
 from copem_replay.units import list_instants
 
-ROWS_AT_ONCE = 4_000_000
-"""A log with at most so many candidate rows is one stretch (chosen: about 2 GB at most)."""
-ROWS_A_STRETCH = 500_000
+ROWS_AT_ONCE = 500_000
+"""A log with at most so many candidate rows is one stretch (chosen: shown, too, it takes about 1 GB)."""
+ROWS_A_STRETCH = 250_000
 """Candidate rows of a stretch of a longer one (chosen: a few hundred MB)."""
+ROWS_HELD = 4_000_000
+"""What needs all of a log at once gets it where it has at most so many (chosen: some GB)."""
 _AFTER = 0.381966
 """Where between two frames a cut is (chosen: hardly any latency brings a list there)."""
 
@@ -42,9 +45,7 @@ def stretches(scene: Scene, truth: Tracks, experiment: Experiment) -> tuple[Stre
     """A log in stretches of about as many candidate rows each; `experiment`: with a unit per carrier."""
     if not _can_be_cut(experiment.configurations.values()):
         return (WHOLE,)
-    lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
-    # The truth is perceived, too.
-    rows = len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
+    rows = candidate_rows(scene, truth, experiment)
     if rows <= ROWS_AT_ONCE:
         return (WHOLE,)
     _, bounds = truth.by_frame
@@ -57,37 +58,48 @@ def stretches(scene: Scene, truth: Tracks, experiment: Experiment) -> tuple[Stre
     return tuple(Stretch(*pair) for pair in pairwise(cuts))
 
 
+def candidate_rows(scene: Scene, truth: Tracks, experiment: Experiment) -> float:
+    """About how many there are, those of the truth, which is perceived, too, among them."""
+    lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
+    return len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
+
+
 def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
     return all(fusion.resumable for c in configurations if isinstance(fusion := c.fusion, ListFusion))
 
 
 class Reach:
-    """How long ago a list may have been captured that is gone by at an instant of a stretch, or needed once more.
+    """How early a list may have been captured that is gone by at an instant of a stretch, or needed once more.
 
     `heard`: by configuration the lists that its receiver hears, whatever is in them.
     """
 
     def __init__(self, experiment: Experiment, heard: Mapping[str, Tracks]) -> None:
-        self._age_s = 0.0
+        self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
         self._again: list[tuple[Float, Float]] = []
         for name, configuration in experiment.configurations.items():
-            arrives_s, captured_s = heard[name].arrives_s[0], heard[name].captured_s
-            came = np.flatnonzero(np.isfinite(arrives_s))
-            if not len(came):
+            mine = heard[name]
+            at = instants(mine, max_age_s=configuration.max_age_s)
+            if not len(at.issue_s):
                 continue
-            on_its_way_s = float((arrives_s[came] - captured_s[came]).max())
-            self._age_s = max(self._age_s, on_its_way_s + configuration.max_age_s + AROUND_S)
+            # What arrives at an instant, and what else is gone by.
+            oldest_s = np.minimum.reduceat(mine.captured_s[at.arrived], at.arrived_start[:-1])
+            used_s = np.where(at.newest >= 0, mine.captured_s[at.newest], np.inf)
+            self._oldest.append((at.issue_s, np.minimum(oldest_s, used_s.min(axis=1))))
             fusion = configuration.fusion
             if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
-                came = came[np.argsort(arrives_s[came], kind="stable")]
-                newest_s = np.maximum.accumulate(captured_s[came])
-                self._again.append((arrives_s[came], newest_s - fusion.looks_back_s - AROUND_S))
+                arrives_s, captured_s = mine.arrives_s[0, at.arrived], mine.captured_s[at.arrived]
+                newest_s = np.maximum.accumulate(captured_s)
+                self._again.append((arrives_s, newest_s - fusion.looks_back_s - AROUND_S))
 
-    def earliest_s(self, from_s: float) -> float:
-        """The earliest capture that a stretch from an instant on needs."""
-        earliest_s = from_s - self._age_s
+    def earliest_s(self, stretch: Stretch) -> float:
+        """The earliest capture that a stretch needs."""
+        earliest_s = stretch.from_s
+        for issue_s, oldest_s in self._oldest:
+            first, after = np.searchsorted(issue_s, (stretch.from_s, stretch.until_s))
+            earliest_s = min(earliest_s, float(oldest_s[first:after].min(initial=np.inf)) - AROUND_S)
         for arrives_s, needed_s in self._again:
-            arrived = int(np.searchsorted(arrives_s, from_s))
+            arrived = int(np.searchsorted(arrives_s, stretch.from_s))
             if arrived:
                 earliest_s = min(earliest_s, float(needed_s[arrived - 1]))
         return earliest_s

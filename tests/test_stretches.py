@@ -18,6 +18,7 @@ import scenes
 import test_recorded
 from copem_replay import cli, stretches
 from copem_replay.accuracy_tables import AccuracyTables
+from copem_replay.believe import listen, seen_by_all
 from copem_replay.check import problems, read_logs
 from copem_replay.experiment import Experiment
 from copem_replay.experiment_file import load, log_paths
@@ -30,6 +31,7 @@ from copem_replay.run import Result, run
 from copem_replay.stretches import WHOLE, Reach, Stretch
 from recordings import Obj, pedestrian, write_recording
 from scenes import Thing, driving, experiment, standing
+from test_show import rows
 
 LOGS = Path(__file__).parents[1] / "logs"
 
@@ -43,12 +45,20 @@ class AllAtOnce(ListFusion):
         return Union().fuse(reports)
 
 
-def both_ways(plan: Experiment, recordings: Sequence[Recording], rows: int) -> tuple[Result, Result]:
+def shown_in(path: Path) -> dict[str, list[str]]:
+    """By entity what a recording says of it at which instants, however it is cut into chunks."""
+    from rerun.chunk import RrdReader
+
+    entities = {chunk.entity_path for chunk in RrdReader(path).stream()}
+    return {entity: sorted(str(sorted(row.items())) for row in rows(path, entity)) for entity in entities}
+
+
+def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: int) -> tuple[Result, Result]:
     """In one piece, and in stretches of so many candidate rows."""
     whole = run(plan, recordings)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stretches, "ROWS_AT_ONCE", 1)
-        patch.setattr(stretches, "ROWS_A_STRETCH", rows)
+        patch.setattr(stretches, "ROWS_A_STRETCH", rows_at_once)
         return whole, run(plan, recordings)
 
 
@@ -213,30 +223,49 @@ def test_stretches_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = [len(replay.found(stretch).tracks.frame_ix) for stretch in cuts]
     assert sum(rows) == len(replay.found(WHOLE).tracks.frame_ix)
     assert max(rows) <= 40
+    alone = Beliefs(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
+    assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
+    monkeypatch.setattr("copem_replay.replay.ROWS_HELD", 40)
     with pytest.raises(Exception, match="too long to be held at once; take a window of it"):
         Beliefs(replay, experiment(), 0).whole()
 
 
 def test_how_far_back_a_stretch_reaches() -> None:
-    """Lists captured every second arrive 0.4 s later and are gone by for 1 s; a tracker hears 2 s of them anew."""
+    """Lists captured every second arrive 0.4 s later; the receiver goes by each until the next; a tracker by 2 s."""
     plan = experiment(configurations={"ideal": {"units": ["ego"], "latency_s": 0.4}})
     log = scenes.recording([Thing("ego", "car", standing(0, 0))], until_s=10.0, rate_hz=1.0)
     heard = log.truth.captured_between(np.inf, np.inf)  # what is in the lists does not matter
     late = Recording(**{**vars(log), "truth": heard}).truth
     late = type(late)(**{**{f: getattr(late, f) for f in late.__dataclass_fields__}, "arrives_s": late.arrives_s + 0.4})
-    assert Reach(plan, {"ideal": late}).earliest_s(5.0) == pytest.approx(5.0 - 1.4, abs=0.01)
-    assert Reach(plan, {"ideal": late}).earliest_s(-np.inf) == -np.inf
+    reach = Reach(plan, {"ideal": late})
+    # From 5.2 s on: the first instant is 5.4 s, at which the list captured at 5 s arrives.
+    assert reach.earliest_s(Stretch(5.2, 8.0)) == pytest.approx(5.0, abs=0.01)
+    assert reach.earliest_s(Stretch(5.2, 5.3)) == 5.2  # no instant at all
+    assert reach.earliest_s(Stretch(4.8, 8.0)) == pytest.approx(4.8, abs=0.01)
+    assert reach.earliest_s(Stretch()) == -np.inf
     tracker = {"kind": "tracker", "late": "replay", "buffer_s": 2.0}
     replayed = experiment(configurations={"t": {"units": ["ego"], "latency_s": 0.4, "fusion": tracker}})
     # At 5.0 s the newest that has arrived was captured at 4 s: 2 s before that.
-    assert Reach(replayed, {"t": late}).earliest_s(5.0) == pytest.approx(2.0, abs=0.01)
-    assert isinstance(Stretch(), Stretch)
+    assert Reach(replayed, {"t": late}).earliest_s(Stretch(5.0, 8.0)) == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_stretch_reaches_back_to_a_list_that_another_unit_still_goes_by() -> None:
+    """One unit's list of 2 s is the newest it has for a second: an instant of the other one at 2.9 s goes by it."""
+    plan = experiment(
+        units={"ego": scenes.EGO_UNIT, "slow": {"at": [0, 9], "height_m": 5.0, "pem": "sure", "rate_hz": 1.0}},
+        configurations={"ideal": {"units": "all", "latency_s": {"default": 0.2}}},
+    )
+    replay = prepare(traffic(), plan)
+    lists = replay.lists_only(plan)
+    seen = seen_by_all(lists, np.arange(1), states="true")
+    heard = {"ideal": listen(seen, lists.truth, lists.experiment, lists.experiment.configurations["ideal"])}
+    assert Reach(plan, heard).earliest_s(Stretch(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 
 def test_the_results_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All its files but the .rrd are the same, and of that one it is said what a long log's lacks."""
+    """All its files but the .rrd are the same, and that one has the same entities with the same in them."""
     frames = [
         (0.1 * k, [Obj(id=1, x=1.0 * k), pedestrian(id=2, x=20.0, y=-3 + 0.1 * k), Obj(id=3, x=40.0 - k, y=4.0)])
         for k in range(41)
@@ -249,17 +278,22 @@ def test_the_results_folder(
         "{kind: gnn}}, tracker: {units: all, fusion: {kind: tracker}}}\n"
     )
     monkeypatch.chdir(tmp_path)
-    for out, rows in (("whole", 10**9), ("pieces", 60)):
+    for out, count in (("whole", 10**9), ("pieces", 60)):
         with monkeypatch.context() as patch:
-            patch.setattr(stretches, "ROWS_AT_ONCE", rows)
-            patch.setattr(stretches, "ROWS_A_STRETCH", rows)
+            patch.setattr(stretches, "ROWS_AT_ONCE", count)
+            patch.setattr(stretches, "ROWS_A_STRETCH", count)
             patch.setattr("sys.argv", ["copem-replay", "run", "plan.yaml", "--out", out])
             with pytest.raises(SystemExit) as ended:
                 cli.main()
             assert ended.value.code == 0
-    said = capsys.readouterr().err
-    assert said.count("replay.rrd: a long log: without words, lines and lanes of why; a window of it has them") == 1
+    assert "long" not in capsys.readouterr().err
     files = {path.name for path in (tmp_path / "whole").iterdir()}
     assert files == {path.name for path in (tmp_path / "pieces").iterdir()}
-    for name in files - {"replay.rrd", "provenance.json"}:
+    for name in files - {"replay.rrd"}:
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "pieces" / name).read_bytes(), name
+    whole, pieces = (shown_in(tmp_path / out / "replay.rrd") for out in ("whole", "pieces"))
+    assert {"/world/gnn/status", "/world/ideal/listings", "/lanes/2\\ pedestrian"} <= whole.keys()
+    why = [name for name in whole if name.endswith(("status", "hiding", "listings")) or name.startswith("/lanes")]
+    assert len(why) == 4 + 3 + 2  # of all configurations, of those with units, of both objects
+    assert {name: whole[name] for name in why} == {name: pieces[name] for name in why}
+    assert whole.keys() == pieces.keys()

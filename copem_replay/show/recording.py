@@ -17,6 +17,7 @@ from copem_replay.replay import Replay
 from copem_replay.show import differences, knowledge, layout, marks, plots, units, words, world
 from copem_replay.show.choice import SHOWN_OBJECTS, VIEWED, telling, viewed
 from copem_replay.show.eye import eye_on, follow
+from copem_replay.show.kept import Kept
 from copem_replay.show.out import Out, digest, part_of
 from copem_replay.show.sight import sight
 from copem_replay.show.status import status_of
@@ -72,10 +73,15 @@ def write_rrd(
             follow(out, replay, experiment, eye)
             _properties(out, replay, experiment, chosen, run, run_is)
             _world(out, replay, experiment, table[of_chosen], summary, run, shown, left_out, colours)
-            if len(replay.stretches) == 1:
-                _knowledge(out, replay, experiment, first, table[of_chosen], shown, colours, baseline)
-            for stretch in chain([first], rest):
+            if baseline is not None:  # of all objects at once: such a log is not long
+                kept = {name: first[name] for name in colours}
+                differences.differences(out, replay, experiment, kept, table[of_chosen], baseline, shown, colours)
+            told, of_stretch = Kept(shown), chain(iter([first]), rest)
+            del first  # one stretch's is held at a time
+            for stretch in of_stretch:
                 _believed(out, replay, experiment, stretch, shown, colours)
+                told.add({name: stretch[name] for name in colours})
+            _knowledge(out, replay, experiment, told.whole(), shown, colours)
     finally:
         rr.set_strict_mode(strict)
         if live is not None:
@@ -85,8 +91,6 @@ def write_rrd(
         said.append(
             f"{path.name}: without {', '.join(left_out)}; `show: {{configurations: […]}}` chooses up to {VIEWED}"
         )
-    if len(replay.stretches) > 1:
-        said.append(f"{path.name}: a long log: without words, lines and lanes of why; a window of it has them")
     if live is not None and live.gone:
         said.append(f"{path.name}: the viewer at {viewer} went before it had everything; the file is complete")
     return said
@@ -123,10 +127,10 @@ def _world(
 
 
 def _knowledge(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
-    shown: Sequence[int], colours: Mapping[str, Rgb], baseline: str | None,
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], shown: Sequence[int],
+    colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
-    """Why, and since when: it takes all of the log at once."""
+    """Why, and since when. `beliefs`: of the shown objects, over all of the log."""
     seen = sight(replay, experiment, shown)
     made = {}
     for name, colour in colours.items():
@@ -136,9 +140,6 @@ def _knowledge(
         asked = experiment.configurations[name]
         knowledge.listings(out, name, replay, experiment, asked, beliefs[name], seen, colour)
     knowledge.lanes(out, replay.scene, seen, made, colours)
-    if baseline is not None:
-        kept = {name: beliefs[name] for name in colours}
-        differences.differences(out, replay, experiment, kept, table, baseline, shown, colours)
 
 
 def _believed(

@@ -11,8 +11,9 @@ from copem_replay.experiment import Experiment, Unit
 from copem_replay.pem.condition import Condition, Couple
 from copem_replay.pem.look import Look
 from copem_replay.replay import Replay
-from copem_replay.resample import at_instants, wrap
+from copem_replay.resample import AROUND_S, at_instants, wrap
 from copem_replay.show.out import f32
+from copem_replay.stretches import ROWS_A_STRETCH
 from copem_replay.tracks import Bool, Float, Int, Tracks
 from copem_replay.units import Poses, carrier, observers, poses, unit_ground
 from copem_replay.visibility import hidden_by, visible_shares
@@ -42,9 +43,6 @@ def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight
     """Computed only at the frames at which one of the shown objects is there."""
     scene, truth = replay.scene, replay.truth
     stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
-    world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    rows, column = _rows(world, shown)
-    frame = world.frame_ix[rows]
     shape = (len(experiment.units), len(stamps), len(shown))
     seen = Sight(
         elapsed_ns=stamps - scene.t0_ns,
@@ -56,8 +54,23 @@ def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight
         place_m=np.full((*shape[:2], 3), np.nan),
     )
     obstacles = _obstacle_centres(replay, experiment)
+    # So many frames at once as have the rows of a stretch: what hides an object is searched among all that is there.
+    at_once = max(1, ROWS_A_STRETCH * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
+    for first in range(0, len(stamps), at_once):
+        _look_at(replay, experiment, seen, slice(first, first + at_once), obstacles)
+    return seen
+
+
+def _look_at(replay: Replay, experiment: Experiment, seen: Sight, part: slice, obstacles: np.ndarray) -> None:
+    """From all units at some of the frames. Out: their part of `seen`."""
+    scene, truth, shown = replay.scene, replay.truth, seen.object_ix.tolist()
+    world = _world(replay, experiment, seen.elapsed_ns[part])
+    rows, column = _rows(world, shown)
+    if not len(rows):
+        return
+    frame = part.start + world.frame_ix[rows]
     for u, (name, unit) in enumerate(experiment.units.items()):
-        if unit.recorded is not None or not len(rows):
+        if unit.recorded is not None:
             continue
         at = poses(scene, unit, world, unit_ground(truth, name, unit, []))
         watching = observers([at], np.array([carrier(scene, unit)]))
@@ -65,11 +78,18 @@ def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight
         look = _look(at, world, rows, scene.object_class[world.row_object_ix[rows]])
         pem = experiment.pems[str(unit.pem)]
         in_field = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
-        seen.place_m[u] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
+        seen.place_m[u, part] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
         seen.in_range[u, frame, column] = _anywhere(pem, look, "range_m")
         seen.share[u, frame, column] = np.where(in_field, share[rows], np.nan)
-        _hidden(replay, experiment, unit, at, seen, u, obstacles)
-    return seen
+        _hidden(replay, experiment, unit, at, seen, u, part, obstacles)
+
+
+def _world(replay: Replay, experiment: Experiment, elapsed_ns: Int) -> Tracks:
+    """The truth at frames (K,), ascending."""
+    t0_ns, gap_s = replay.scene.t0_ns, experiment.max_gap_s
+    around_s = gap_s + AROUND_S
+    near = replay.truth.captured_between(elapsed_ns[0] * 1e-9 - around_s, elapsed_ns[-1] * 1e-9 + around_s)
+    return at_instants(near, t0_ns + elapsed_ns, t0_ns=t0_ns, max_gap_s=gap_s)
 
 
 def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
@@ -79,16 +99,20 @@ def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
 
 
 def _hidden(
-    replay: Replay, experiment: Experiment, unit: Unit, at: Poses, seen: Sight, u: int, obstacles: np.ndarray
-) -> None:
-    """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`."""
-    frames = np.flatnonzero((seen.share[u] <= CLEAR_ABOVE).any(axis=1))
-    if not len(frames):
+    replay: Replay, experiment: Experiment, unit: Unit, at: Poses, seen: Sight, u: int, part: slice,
+    obstacles: np.ndarray,
+) -> None:  # fmt: skip
+    """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`.
+
+    `at`: where the unit is at the frames of the `part`.
+    """
+    within = np.flatnonzero((seen.share[u, part] <= CLEAR_ABOVE).any(axis=1))
+    if not len(within):
         return
-    scene, gap_s = replay.scene, experiment.max_gap_s
-    world = at_instants(replay.truth, scene.t0_ns + seen.elapsed_ns[frames], t0_ns=scene.t0_ns, max_gap_s=gap_s)
-    then = Poses(*(getattr(at, name)[frames] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
-    watching = observers([then], np.array([carrier(scene, unit)]))
+    frames = part.start + within
+    world = _world(replay, experiment, seen.elapsed_ns[frames])
+    then = Poses(*(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
+    watching = observers([then], np.array([carrier(replay.scene, unit)]))
     [hides] = hidden_by(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
     rows, column = _rows(world, seen.object_ix.tolist())
     kept = hides[rows] != -1  # nothing hides any of it
