@@ -177,12 +177,12 @@ def ms(time_s: float) -> int:
 def in_closed_form(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, Times]:
     """What the package says, object by object."""
     result = {}
-    for object_ix, (time_s, probability) in zip(ready.looks.object_ix, distributions(ready, plan, name), strict=True):
-        assert (np.diff(time_s) > 0).all()
-        assert (probability >= -1e-15).all()
-        times: Times = {ms(t): float(p) for t, p in zip(time_s, probability, strict=True)}
-        assert len(times) == len(time_s)
-        result[ready.scene.object_ids[object_ix]] = {**times, NEVER: 1 - sum(times.values())}
+    for object_ix, of in zip(ready.looks.object_ix, distributions(ready, plan, name), strict=True):
+        assert (np.diff(of.time_s) > 0).all()
+        assert (of.probability >= 0).all()
+        times: Times = {ms(t): float(p) for t, p in zip(of.time_s, of.probability, strict=True)}
+        assert len(times) == len(of.time_s)
+        result[ready.scene.object_ids[object_ix]] = {**times, NEVER: math.exp(of.log_never)}
     return result
 
 
@@ -350,11 +350,12 @@ def test_the_truth_is_certain() -> None:
             units={},
             measure={"onset": {"kind": "appears"}, "confirm": {"hits": hits, "of": of}},
         )
-        (time_s, probability), *others = distributions(ready, plan, "GT")
+        of, *others = distributions(ready, plan, "GT")
         assert not others
-        assert ms(time_s[0]) == 500
-        assert [ms(t) for t, p in zip(time_s, probability, strict=True) if p > 0] == [known]
-        assert probability.sum() == 1
+        assert ms(of.time_s[0]) == 500
+        assert [ms(t) for t, p in zip(of.time_s, of.probability, strict=True) if p > 0] == [known]
+        assert of.probability.sum() == 1
+        assert of.log_never == -math.inf
 
 
 # -------------------------------------------------------------------------------------------------- by hand
@@ -381,11 +382,16 @@ def exact(plan: Experiment, log: Recording) -> pd.DataFrame:
     return exact_table(prepare(log, plan), plan)
 
 
+def near(values: list[float]) -> Any:
+    """The same to rounding, be they ever so small."""
+    return pytest.approx(values, rel=1e-13, abs=0)
+
+
 class TestByHand:
     def test_heads_or_tails(self) -> None:
         rows = exact(masts(1), one_walker())
-        assert rows["probability"].tolist() == [0.5 ** (k + 1) for k in range(11)] + [0.5**11]
-        assert rows["incidence"].tolist()[:-1] == [1 - 0.5 ** (k + 1) for k in range(11)]
+        assert rows["probability"].tolist() == near([0.5 ** (k + 1) for k in range(11)] + [0.5**11])
+        assert rows["incidence"].tolist()[:-1] == near([1 - 0.5 ** (k + 1) for k in range(11)])
         assert rows["detection_s"].tolist()[:-1] == pytest.approx([0.1 * k for k in range(11)])
         assert rows["time_to_detection_s"].tolist()[:-1] == pytest.approx([0.1 * k for k in range(11)])
         assert rows["distance_at_detection_m"].tolist()[:-1] == [20] * 11
@@ -420,28 +426,28 @@ class TestByHand:
         rows = exact(plan, one_walker())
         known = [k for k in range(11) if 0.1 * k + latency <= 1 + 1e-9]
         assert rows["detection_s"].tolist()[:-1] == pytest.approx([0.1 * k + latency for k in known])
-        assert rows["probability"].tolist() == [0.5 ** (k + 1) for k in known] + [0.5 ** len(known)]
+        assert rows["probability"].tolist() == near([0.5 ** (k + 1) for k in known] + [0.5 ** len(known)])
 
     def test_latency_of_one_of_two(self) -> None:
         """One at once, the other 0.25 s late: it adds to none of the ego's instants, but comes in between."""
         plan = masts(2, configurations={"all": {"units": "all", "latency_s": {"m0": 0.0, "m1": 0.25}}})
         rows = exact(plan, one_walker())
         assert [round(t, 9) for t in rows["detection_s"][:6]] == [0, 0.1, 0.2, 0.25, 0.3, 0.35]
-        assert rows["probability"].tolist()[:6] == [2.0 ** -(k + 1) for k in range(6)]
+        assert rows["probability"].tolist()[:6] == near([2.0 ** -(k + 1) for k in range(6)])
 
     def test_two_heads_in_a_row(self) -> None:
         """Of 2ⁿ ways to toss n times Fibonacci's (n − 1)-th number end in the first two heads in a row."""
         plan = masts(1, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 2}})
         rows = exact(plan, one_walker())
         fibonacci = [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55]
-        assert rows["probability"].tolist()[:-1] == [f / 2 ** (n + 1) for n, f in enumerate(fibonacci)]
+        assert rows["probability"].tolist()[:-1] == near([f / 2 ** (n + 1) for n, f in enumerate(fibonacci)])
         assert rows["probability"].tolist()[-1] == pytest.approx(233 / 2**11)  # no two in a row: again Fibonacci's
 
     def test_two_of_three(self) -> None:
         """Of tosses, by their number: HH; HTH, THH; TTHH, THTH; HTTHH, TTTHH, TTHTH."""
         plan = masts(1, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 3}})
         rows = exact(plan, one_walker())
-        assert [p * 2 ** (n + 1) for n, p in enumerate(rows["probability"][:5])] == [0, 1, 2, 2, 3]
+        assert [p * 2 ** (n + 1) for n, p in enumerate(rows["probability"][:5])] == near([0, 1, 2, 2, 3])
 
     def test_what_was_captured_before_the_onset(self) -> None:
         """The onset is at 0.42 s; counted from the beginning the times are negative at first."""
@@ -450,11 +456,11 @@ class TestByHand:
         assert rows["time_to_detection_s"].tolist()[:-1] == pytest.approx([0.08 + 0.1 * k for k in range(6)])
         rows = exact(masts(1, measure=onset | {"count_earlier": True}), one_walker())
         assert rows["time_to_detection_s"].tolist()[:-1] == pytest.approx([-0.42 + 0.1 * k for k in range(11)])
-        assert rows["probability"].tolist()[-1] == 0.5**11
+        assert rows["probability"].tolist()[-1] == pytest.approx(0.5**11, rel=1e-13)
 
     def test_who_leaves(self) -> None:
         rows = exact(masts(1), one_walker(lambda t: 0.25 < t < 0.55))
-        assert rows["probability"].tolist() == [0.5, 0.25, 0.125, 0.125]
+        assert rows["probability"].tolist() == near([0.5, 0.25, 0.125, 0.125])
         assert set(rows["ended_by"]) == {"object_left"}
 
     def test_nobody_lists(self) -> None:
@@ -857,13 +863,20 @@ def test_the_file(
         "log": text, "configuration": text, "object_id": text, "object_class": text, "onset_s": number,
         "detection_s": number, "probability": number, "incidence": number, "time_to_detection_s": number,
         "distance_at_detection_m": number, "gap_at_detection_m": number, "ended_s": number, "ended_by": text,
+        "miss_log10": number, "miss_per_logit": number, "miss_log10_half_odds": number,
     }  # fmt: skip
-    more = {"conflict": pa.bool_(), "pass_probability": number} if braking else {}
+    more = {"conflict": pa.bool_(), "pass_probability": number, "fail_probability": number} if braking else {}
     assert {f.name: f.type for f in table.schema} == columns | more
     rows = table.to_pylist()
     # From 1 s on, when the car is 60 m away, to 3 s; the lists of coPEM half a second later.
     assert [sum(r["configuration"] == name for r in rows) for name in ("GT", "PEM", "coPEM")] == [22, 22, 17]
     for row in rows:
+        of_never = [row[name] for name in ("miss_log10", "miss_per_logit", "miss_log10_half_odds")]
+        if row["detection_s"] is not None or row["configuration"] == "GT":
+            assert of_never == [None] * 3, "of never alone, and null where detection is certain"
+        else:  # lists that each hold it with ½, with half the odds 1 : 2
+            count = {"PEM": 21, "coPEM": 32}[row["configuration"]]
+            assert of_never == near([count * math.log10(1 / 2), -count / 2, count * math.log10(2 / 3)])
         if row["detection_s"] is None:
             lacking = ("incidence", "time_to_detection_s", "distance_at_detection_m", "gap_at_detection_m")
             assert [row[name] for name in lacking] == [None] * 4
@@ -876,7 +889,7 @@ def test_the_file(
             assert row["probability"] == pytest.approx(0.75 * 0.25**k)
             assert row["distance_at_detection_m"] == pytest.approx(55 - k)
         if braking:
-            assert (row["conflict"], row["pass_probability"]) == (False, None)
+            assert [row[name] for name in ("conflict", "pass_probability", "fail_probability")] == [False, None, None]
 
 
 # -------------------------------------------------------------------------------------- summaries of exact times
@@ -961,20 +974,31 @@ class TestSummary:
             times = data.draw(st.lists(marks, min_size=16, max_size=16))
             base = {"log": "x", "configuration": "c", "object_id": str(k), "onset_s": 0.0, "ended_s": ended_s,
                     "ended_by": ended_by}  # fmt: skip
-            for t, count in Counter(times).items():
+            # Of each look there is a row for never, be it that it cannot be.
+            for t, count in ({NEVER: 0} | Counter(times)).items():
                 at = math.nan if t is None else t
                 row = base | {
                     "detection_s": at,
                     "time_to_detection_s": at,
                     "distance_at_detection_m": math.nan if t == 0.25 and k == 0 else 10 - at,
                 }
-                rows.append(row | {"probability": count / 16})
+                of_never = dict.fromkeys(("miss_log10", "miss_per_logit", "miss_log10_half_odds"), math.nan)
+                if t is None and count:
+                    of_never |= {"miss_log10": math.log10(count / 16), "miss_per_logit": -k, "miss_log10_half_odds": 0}
+                rows.append(row | {"probability": count / 16} | of_never)
                 table += [row | {"detected": t is not None, "run": 0}] * count
         rates = {"c": None}
         frame = pd.DataFrame(table)
         (row,) = summary(frame, ["c"], rates, seed=0, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict("records")
         for name in ("detected_share", "ttd_rmst_s"):
             assert row[f"{name}_exact"] == pytest.approx(row[name], abs=1e-12)
+        missed = frame.loc[~frame["detected"], "object_id"].astype(float)
+        if len(missed):
+            assert row["miss_log10"] == pytest.approx(math.log10(len(missed) / (16 * looks)), abs=1e-12)
+            assert row["miss_per_logit"] == pytest.approx(-missed.mean(), abs=1e-12), "by how probable each is"
+            assert row["miss_log10_half_odds"] == pytest.approx(math.log10(missed.nunique() / looks), abs=1e-12)
+        else:
+            assert [row[n] for n in ("miss_log10", "miss_per_logit", "miss_log10_half_odds")] == [None] * 3
         for name in ("ttd_p5_s", "ttd_median_s", "ttd_p95_s", "dad_median_m", "dad_p5_m"):
             assert row[f"{name}_exact"] == row[name] or (row[f"{name}_exact"] is None and row[name] is None), name
 
