@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mpmath
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -22,9 +23,11 @@ import pytest
 import scipy.stats
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from mpmath import mp, mpf
 from pyarrow import parquet
 
 from copem_replay import cli
+from copem_replay.braking.driver import Reaction
 from copem_replay.braking.verdict import judge
 from copem_replay.check import problems, read_logs
 from copem_replay.detect import detect
@@ -37,6 +40,7 @@ from copem_replay.replay import Replay, listen, prepare
 from copem_replay.run import Result, run
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
 from copem_replay.summary import summary
+from copem_replay.tracks import Float
 from experiments import changed, drive, source_of
 from scenes import Thing, driving, experiment, recording, standing
 
@@ -507,6 +511,74 @@ class TestByHand:
         pd.testing.assert_frame_equal(asked.summary[list(result.summary)], result.summary)
 
 
+class TestTails:
+    def test_never_where_one_minus_the_rest_is_nothing(self) -> None:
+        """Two masts, eleven lists each, odds of 9 : 1: never with 10⁻²², at half the odds with (2/11)²²."""
+        result = run(masts(2, 0.9), [one_walker()])
+        assert result.exact is not None
+        never, row = result.exact.iloc[-1], result.summary.iloc[0]
+        assert never["probability"] == pytest.approx(1e-22, rel=1e-12)
+        for found in (never, row):
+            assert found["miss_log10"] == pytest.approx(-22, rel=1e-13)
+            assert found["miss_per_logit"] == pytest.approx(-22 * 0.9, rel=1e-13)
+            assert found["miss_log10_half_odds"] == pytest.approx(22 * math.log10(2 / 11), rel=1e-13)
+
+    def test_a_logarithm_where_there_is_no_double_any_more(self) -> None:
+        row = run(masts(110, 0.999), [one_walker()]).summary.iloc[0]
+        assert row["miss_log10"] == pytest.approx(-3 * 110 * 11, rel=1e-12)
+
+    def test_when_two_of_two_are_asked_for(self) -> None:
+        """Three lists: all miss but the middle one, or but one at an end, or all, or but both ends."""
+        there = one_walker(lambda t: t < 0.25)
+        plan = masts(1, 0.999, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 2}, "exact": True})
+        row = run(plan, [there]).summary.iloc[0]
+        p, q = 0.999, 1 - 0.999
+        assert row["miss_log10"] == pytest.approx(math.log10(q**3 + 3 * p * q**2 + p * p * q), rel=1e-13)
+
+    def test_over_objects(self) -> None:
+        """b has left after two lists, a after four; odds of 9 : 1: the mean of 10⁻⁴ and 10⁻² hangs on b's lists."""
+        things = [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("a", "pedestrian", standing(20, 0), lambda t: t < 0.35),
+            Thing("b", "pedestrian", standing(30, 0), lambda t: t < 0.15),
+        ]
+        row = run(masts(1, 0.9), [recording(things, until_s=1.0)]).summary.iloc[0]
+        assert row["miss_log10"] == pytest.approx(math.log10((1e-4 + 1e-2) / 2), rel=1e-13)
+        assert row["miss_per_logit"] == pytest.approx(-(1e-4 * 3.6 + 1e-2 * 1.8) / (1e-4 + 1e-2), rel=1e-12)
+        half = math.log10(((2 / 11) ** 4 + (2 / 11) ** 2) / 2)
+        assert row["miss_log10_half_odds"] == pytest.approx(half, rel=1e-13)
+
+    def test_where_some_are_certain(self) -> None:
+        """Over all looks, those that cannot miss included; where none can, there is no logarithm."""
+        things = [Thing("ego", "car", standing(0, 0)), Thing("a", "pedestrian", standing(20, 0))]
+        log = recording([*things, Thing("b", "car", standing(30, 0))], until_s=1.0)
+        couples = [
+            {"when": {"classes": ["car"]}, "detection": {"kind": "constant", "probability": 1.0}},
+            {"detection": {"kind": "constant", "probability": 0.9}},
+        ]
+        both = {"all": {"units": "all"}, "GT": {"units": "truth"}}
+        rows = run(masts(1, pems={"p": couples}, configurations=both), [log]).summary.set_index("configuration")
+        assert rows.loc["all", "miss_log10"] == pytest.approx(math.log10(1e-11 / 2), rel=1e-13)
+        assert rows.loc["all", "miss_per_logit"] == pytest.approx(-9.9, rel=1e-13)
+        assert rows.loc["GT", ["miss_log10", "miss_per_logit", "miss_log10_half_odds"]].isna().all()
+
+    def test_who_may_be_there(self) -> None:
+        """A mast's lists miss with 10⁻¹¹; a car at 0.5 that is there misses with 10⁻¹¹ more, else with all of it."""
+        things = [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("v", "car", standing(0, 9)),
+            Thing("a", "pedestrian", standing(20, 0)),
+        ]
+        units = {
+            "mast": {"at": [20, 5], "height_m": 5.0, "pem": "p"},
+            "fleet": {"on": {"classes": ["car"], "share": 0.5}, "pem": "p"},
+        }
+        measure = {"onset": {"kind": "appears"}, "objects": {"classes": ["pedestrian"]}, "exact": True}
+        row = run(masts(1, 0.9, units=units, measure=measure), [recording(things, until_s=1.0)]).summary.iloc[0]
+        assert row["miss_log10"] == pytest.approx(-11 + math.log10(0.5 + 0.5e-11), rel=1e-13)
+        assert row["miss_per_logit"] == pytest.approx(-9.9 * (1 + 1e-11 / (1 + 1e-11)), rel=1e-13)
+
+
 @SOME
 @given(worlds())
 def test_probabilities_sum_to_one_and_the_incidence_is_their_sum(world: World) -> None:
@@ -819,6 +891,53 @@ class TestPassing:
         part = result.exact[(result.exact["configuration"] == "all") & result.exact["conflict"]]
         assert part["pass_probability"].tolist() == pytest.approx([1] * 29 + [0] * (len(part) - 29), abs=1e-12)
 
+    def test_failing_is_not_one_minus_passing(self) -> None:
+        """With 0.9 instead: the first 29 lists miss him with 10⁻²⁹."""
+        rows = self.meeting({"kind": "constant", "delay_s": 0.25}, 0.9).summary.set_index("configuration")
+        assert rows.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11)
+        assert rows.loc["GT", "fail_share_exact"] == 0
+        assert rows.loc["all", "miss_log10"] == pytest.approx(-51, rel=1e-12)
+
+    @pytest.mark.parametrize(
+        "reaction",
+        [
+            {"kind": "gamma", "shape": 1.41, "mean_s": 0.05},
+            {"kind": "gamma", "shape": 400.0, "mean_s": 1.0},
+            {"kind": "lognormal", "median_s": 0.05, "sigma": 0.12},
+        ],
+    )
+    def test_failing_by_the_reactions_far_tail(self, reaction: dict[str, Any]) -> None:
+        """Known at 0 s, as by the truth, it fails when the reaction takes longer than the 3.1 s that are left.
+
+        Who may miss him fails with the mean of that over the instants at which he may be known, in 60 digits.
+        """
+        result = self.meeting(reaction, 0.9)
+        (between_s,) = result.replays[0].passing_s.values()
+        assert between_s[0, 1] == pytest.approx(3.1, abs=1e-4)
+        rows = result.summary.set_index("configuration")
+        with mp.workdps(60):
+            last_s, never = mpf(between_s[0, 1]), mpf(1 - 0.9) ** 51
+            chance = [(mpf(0.9) * mpf(1 - 0.9) ** k, longer(reaction, last_s - mpf(k) / 10)) for k in range(51)]
+            expected = sum(p * fails for p, fails in chance) + never
+            assert float(longer(reaction, last_s)) < 1e-20
+            assert rows.loc["GT", "fail_share_exact"] == pytest.approx(float(longer(reaction, last_s)), rel=1e-9, abs=0)
+            assert rows.loc["all", "fail_share_exact"] == pytest.approx(float(expected), rel=1e-9, abs=0)
+        assert (rows["pass_share_exact"] == 1).all()
+
+    def test_failing_with_a_reaction_that_gives_no_survival(self) -> None:
+        """At 0.9 it fails with 10⁻²⁹, of which nothing is known; at ½ with 2⁻²⁹."""
+        own = {"kind": "test_exact:Prompt"}
+        result = self.meeting(own, 0.9)
+        rows = result.summary.set_index("configuration")
+        assert rows["fail_share_exact"].isna().all()
+        assert result.exact is not None
+        part = result.exact[result.exact["conflict"] & (result.exact["configuration"] == "all")]
+        assert part["fail_probability"].isna().tolist() == [True] * 29 + [False] * 23
+        rows = self.meeting(own, 0.5).summary.set_index("configuration")
+        assert rows.loc["all", "fail_share_exact"] == pytest.approx(2.0**-29, rel=1e-6)
+        told = self.meeting({"kind": "test_exact:Told"}, 0.9).summary.set_index("configuration")
+        assert told.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11)
+
     def test_by_hand_with_chance_in_the_reaction(self) -> None:
         """With median 0.6 s: known at t it passes with Φ(ln((3.1 − t) / 0.6) / σ)."""
         result = self.meeting({"kind": "lognormal", "median_s": 0.6, "sigma": 0.5})
@@ -843,6 +962,30 @@ class TestPassing:
         # Braking begins at 3.0 s at the earliest; lists of 0 … 2.8 s are soon enough.
         assert rows.loc["all", "pass_share_exact"] == pytest.approx(1 - 0.75**29, abs=1e-12)
         assert rows.loc["all", "pass_share"] == 1
+
+
+class Prompt(Reaction):
+    """A reaction of one's own: 0.25 s."""
+
+    def delays(self, uniform: Float) -> Float:
+        return np.full(len(uniform), 0.25)
+
+
+class Told(Prompt):
+    """It says how probably it takes longer, too."""
+
+    def survival(self, delay_s: Float) -> Float:
+        return np.where(delay_s < 0.25, 1.0, 0.0)
+
+
+def longer(reaction: dict[str, Any], delay_s: Any) -> Any:
+    """The probability that it takes longer, of mpmath."""
+    if delay_s <= 0:
+        return mpf(1)
+    if reaction["kind"] == "gamma":
+        shape = mpf(reaction["shape"])
+        return mpmath.gammainc(shape, delay_s * shape / mpf(reaction["mean_s"]), mpmath.inf, regularized=True)
+    return mpmath.ncdf(-mpmath.log(delay_s / mpf(reaction["median_s"])) / mpf(reaction["sigma"]))
 
 
 @pytest.mark.parametrize("braking", [False, True])

@@ -95,7 +95,7 @@ class LognormalReaction(Reaction):
 
         if self.sigma == 0:
             return np.where(delay_s < self.median_s, 1.0, 0.0)
-        with np.errstate(divide="ignore"):  # no delay: −∞
+        with np.errstate(divide="ignore", over="ignore"):  # no delay, or hardly any sigma: ±∞
             result: Float = ndtr(np.log(self.median_s / delay_s) / self.sigma)
         return result
 
@@ -197,8 +197,8 @@ def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
         if len(off):
             k = off[0]
             raise InputError(
-                f"{what}: expected {1 - _TRIED[k]:g} at {at_s[k]:g} s, which is delays({_TRIED[k]:g}); "
-                f"found {there[k]:g}"
+                f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {there[k]:g}"
             )
     return found
 
