@@ -13,6 +13,7 @@ import pandas as pd
 
 from copem_replay.accuracy import Total
 from copem_replay.accuracy_figures import FIGURES
+from copem_replay.braking.driver import UNRESOLVED
 from copem_replay.chance import Address, Dice, object_words
 from copem_replay.statistics import (
     CENSORED,
@@ -177,19 +178,47 @@ def _exactly(part: pd.DataFrame, horizon_s: float | None, n: int) -> dict[str, f
     otherwise stand for all that were censored before.
     """
     result: dict[str, float | None] = dict.fromkeys(_EXACT)
+    missed = _missed(part[part["detection_s"].isna()])
     if len(part):
         part = part[part["probability"] > 0]
         weight = part["probability"].to_numpy(dtype=float)
         detected = part["detection_s"].notna().to_numpy()
         result = {"detected_share": weight[detected].sum() / weight.sum()}
         result |= _times(part, detected, horizon_s, weight, 1 / n)
-    row = {f"{name}_exact": result[name] for name in _EXACT}
+    row = {f"{name}_exact": result[name] for name in _EXACT} | missed
     if "conflict" in part:
         judged = part[part["conflict"]]
         weight = judged["probability"].to_numpy(dtype=float)
         passes = judged["pass_probability"].to_numpy(dtype=float)
         row["pass_share_exact"] = float(weight @ passes / weight.sum()) if len(judged) else None
+        row["fail_share_exact"] = _failed(judged) if len(judged) else None
     return row
+
+
+def _missed(never: pd.DataFrame) -> dict[str, float | None]:
+    """How probably a look misses its object, from the rows of `exact.parquet` for never: one per look.
+
+    In logarithms; the derivative by the log-odds of detection is that of the mean, so looks count by their share of it.
+    """
+    names = ("miss_log10", "miss_log10_half_odds")
+    if not never["miss_log10"].notna().any():
+        return dict.fromkeys((*names, "miss_per_logit"))
+    shares: dict[str, Float] = {}
+    row: dict[str, float | None] = {}
+    for name in names:
+        log10 = never[name].fillna(-np.inf).to_numpy(dtype=float)
+        shares[name] = np.power(10.0, log10 - log10.max())
+        row[name] = float(log10.max() + np.log10(shares[name].mean()))
+    weight, slope = shares["miss_log10"], never["miss_per_logit"].fillna(0.0).to_numpy(dtype=float)
+    return row | {"miss_per_logit": float(weight @ slope / weight.sum())}
+
+
+def _failed(judged: pd.DataFrame) -> float | None:
+    """The share that fails; None where what is too rare to be resolved may be most of it."""
+    weight = judged["probability"].to_numpy(dtype=float)
+    fails = judged["fail_probability"].to_numpy(dtype=float)
+    share = float(weight @ np.nan_to_num(fails) / weight.sum())
+    return None if share < UNRESOLVED and np.isnan(fails).any() else share
 
 
 def _kind(over: str | None) -> str | None:

@@ -11,13 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mpmath
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.optimize
 import scipy.stats
 import shapely
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from mpmath import mpf
 
 from braking_oracle import Motion, corners, outcome
 from copem_replay.braking.boxes import box_distance, nearest, pose_on, turning
@@ -30,7 +33,7 @@ from copem_replay.braking.driver import (
     Reaction,
 )
 from copem_replay.braking.encounter import Encounter
-from copem_replay.braking.verdict import braked, judge, pass_probability, passing
+from copem_replay.braking.verdict import braked, fail_probability, judge, pass_probability, passing
 from copem_replay.errors import InputError
 from copem_replay.experiment import Experiment
 from copem_replay.read import Recording
@@ -732,6 +735,87 @@ def test_probability_to_pass_with_one_interval() -> None:
     assert pass_probability(between_s[:0], known_s, gamma).tolist() == [0.0] * 7
 
 
+DECADES = st.floats(-300, -0.01)
+"""Of a probability: where on the way from 1 to 10⁻³⁰⁰."""
+
+
+@settings(SOME, max_examples=60)
+@given(shape=st.floats(0.01, 500), mean_s=st.floats(0.01, 10), decades=DECADES)
+def test_survival_of_gamma_to_the_far_tail(shape: float, mean_s: float, decades: float) -> None:
+    """P(D > d) < e^(shape − x) (x / shape)^shape beyond the mean: some d at which it is about 10^decades."""
+    beyond = scipy.optimize.brentq(lambda y: shape * (y - 1 - math.log(y)) + decades * math.log(10), 1, 1e7)
+    delay_s = beyond * mean_s
+    with mpmath.workdps(40):
+        expected = mpmath.gammainc(shape, mpf(delay_s) * mpf(shape) / mpf(mean_s), mpmath.inf, regularized=True)
+    (found,) = GammaReaction(shape=shape, mean_s=mean_s).survival(np.array([delay_s]))
+    assert found == pytest.approx(float(expected), rel=1e-10, abs=1e-305)
+
+
+@settings(SOME, max_examples=60)
+@given(median_s=st.floats(0.01, 10), sigma=st.floats(0.01, 10), deviations=st.floats(-5, 37))
+def test_survival_of_lognormal_to_the_far_tail(median_s: float, sigma: float, deviations: float) -> None:
+    delay_s = median_s * math.exp(sigma * deviations)
+    with mpmath.workdps(40):
+        expected = mpmath.ncdf(-mpmath.log(mpf(delay_s) / mpf(median_s)) / mpf(sigma))
+    (found,) = LognormalReaction(median_s=median_s, sigma=sigma).survival(np.array([delay_s]))
+    # Near the median the logarithm of a quotient that is rounded is divided by sigma, and squared in the tail.
+    assert found == pytest.approx(float(expected), rel=1e-11 + 1e-14 / sigma * max(1.0, deviations))
+
+
+def test_survival_at_the_ends() -> None:
+    """A constant delay, also as a log-normal one: it takes longer than anything below, and not longer than itself."""
+    at_s = np.array([0.0, 0.5, 1.0, 2.0])
+    for reaction in (ConstantReaction(delay_s=1.0), LognormalReaction(median_s=1.0, sigma=0.0)):
+        assert reaction.survival(at_s).tolist() == [1, 1, 0, 0]
+    for reaction in (GammaReaction(shape=0.01, mean_s=1.0), LognormalReaction(median_s=1.0, sigma=1.0)):
+        assert reaction.survival(at_s[:1]).tolist() == [1]
+    assert ConstantReaction().survival(at_s[:1]).tolist() == [0]
+
+
+def test_probability_to_fail_between_and_before_what_passes() -> None:
+    """It passes between 1 and 2 s and from 3 s on; of each part of the failures the smaller tail, to 40 digits."""
+    between_s = np.array([[1.0, 2.0], [3.0, NEVER]])
+    known_s = np.array([0.0, 0.9, 1.5, 2.2, NEVER])
+    gamma = GammaReaction(shape=90.0, mean_s=1.8)  # at most 0.1 s with 10⁻⁶¹
+
+    def within(t: float) -> Any:
+        if t <= 0:
+            return mpf(0)
+        return mpmath.gammainc(90, 0, mpf(t) * 90 / mpf(1.8), regularized=True)
+
+    with mpmath.workdps(200):
+        expected = [
+            float(within(1.0 - t) + within(3.0 - t) - within(2.0 - t)) if math.isfinite(t) else 1.0 for t in known_s
+        ]
+        too_soon = float(within(0.1))
+    np.testing.assert_allclose(fail_probability(between_s, known_s, gamma), expected, rtol=1e-10)
+    both = fail_probability(between_s, known_s, gamma) + pass_probability(between_s, known_s, gamma)
+    np.testing.assert_allclose(both, 1, atol=1e-12)
+    # Where only what comes too soon fails, it is the lower tail.
+    assert too_soon < 1e-60
+    assert fail_probability(np.array([[1.0, NEVER]]), known_s[1:2], gamma) == pytest.approx(too_soon, rel=1e-10, abs=0)
+    # With nothing that passes all fails, whenever it is known.
+    assert fail_probability(between_s[:0], known_s, gamma).tolist() == [1] * 5
+
+
+@settings(SOME, max_examples=60)
+@given(
+    reaction=st.one_of(
+        st.builds(ConstantReaction, delay_s=st.floats(0, 3)),
+        st.builds(GammaReaction, shape=st.floats(0.1, 100), mean_s=st.floats(0.1, 3)),
+        st.builds(LognormalReaction, median_s=st.floats(0.1, 3), sigma=st.floats(0, 3)),
+    ),
+    borders=st.lists(st.floats(0, 9), min_size=2, max_size=6, unique=True).filter(lambda b: len(b) % 2 == 0),
+    known_s=st.lists(st.floats(0, 9) | st.just(NEVER), min_size=1, max_size=5),
+)
+def test_it_passes_or_fails(reaction: Reaction, borders: list[float], known_s: list[float]) -> None:
+    between_s = np.sort(borders).reshape(-1, 2)
+    passes = pass_probability(between_s, np.array(known_s), reaction)
+    fails = fail_probability(between_s, np.array(known_s), reaction)
+    assert ((passes >= 0) & (fails >= 0)).all()
+    np.testing.assert_allclose(passes + fails, 1, atol=1e-12)
+
+
 def test_probability_to_pass_with_two_intervals() -> None:
     """The share of drawn reactions with which the ego is judged to pass, each by itself."""
     encounter, driver = in_conflict(back_and_forth()), ConstantDeceleration(a_max_mps2=8.0)
@@ -1022,6 +1106,40 @@ class One(Reaction):
         return np.array([0.5])
 
 
+class Wrong(Attentive):
+    """Says how probably it takes at most so long, not longer."""
+
+    def survival(self, delay_s: Float) -> Float:
+        return np.where(delay_s < 0.2, 0.0, np.where(delay_s < 0.6, 0.5, 1.0))
+
+
+class Sooner(Attentive):
+    """A survival function of another reaction: 0.5 s at most."""
+
+    def survival(self, delay_s: Float) -> Float:
+        return np.where(delay_s < 0.2, 1.0, np.where(delay_s < 0.5, 0.5, 0.0))
+
+
+class Percents(Attentive):
+    def survival(self, delay_s: Float) -> Float:
+        return np.where(delay_s < 0.6, 50.0, 0.0)
+
+
+class Single(Attentive):
+    def survival(self, delay_s: Float) -> Float:
+        return np.array([0.5])
+
+
+class Stumbles(Attentive):
+    def survival(self, delay_s: Float) -> Float:
+        raise RuntimeError("two\nlines")
+
+
+class Right(Attentive):
+    def survival(self, delay_s: Float) -> Float:
+        return np.where(delay_s < 0.2, 1.0, np.where(delay_s < 0.6, 0.5, 0.0))
+
+
 class Breaks(Reaction):
     def delays(self, uniform: Float) -> Float:
         raise RuntimeError("two\nlines")
@@ -1075,6 +1193,32 @@ def test_a_reaction_that_fails_is_named(kind: str, said: str) -> None:
     with pytest.raises(InputError, match=rf"^braking\.driver\.reaction: test_braking:{kind}: {said}") as failure:
         rows(in_the_way(20), plan(driver=driver), runs=3)
     assert "\n" not in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("Wrong", r"survival\(delay_s\): expected at 0\.6 s, which is delays\(0\.5\), at most 0\.5; found 1"),
+        ("Sooner", r"survival\(delay_s\): expected at 0\.6 s, which is delays\(0\.5\), at least 0\.5; found 0"),
+        ("Percents", r"survival\(delay_s\): expected probabilities 0 … 1, found 50\.0"),
+        ("Single", r"survival\(delay_s\): expected shape \(2,\), found \(1,\)"),
+        ("Stumbles", r"RuntimeError: two lines \(.*test_braking\.py:\d+\)"),
+    ],
+)
+def test_a_survival_that_is_not_of_the_delays_is_named(kind: str, said: str) -> None:
+    own = {"kind": f"test_braking:{kind}"}
+    reaction = plan(driver=BRAKES_8 | {"reaction": own}).braking.driver.reaction  # type: ignore[union-attr]
+    with pytest.raises(InputError, match=rf"^braking\.driver\.reaction: test_braking:{kind}: {said}") as failure:
+        fail_probability(np.array([[-NEVER, 0.3]]), np.array([0.0, 0.1]), reaction)
+    assert "\n" not in str(failure.value)
+
+
+def test_a_survival_of_ones_own() -> None:
+    """Every second one is too late where 0.3 s are left, all where 0.1 s are, none where 0.7 s are."""
+    between_s, known_s = np.array([[-NEVER, 1.0]]), np.array([0.7, 0.9, 0.3])
+    for kind, early in ((Right, 0.0), (Attentive, math.nan)):
+        found = fail_probability(between_s, known_s, kind(kind="x"))
+        np.testing.assert_allclose(found, [0.5, 1.0, early], rtol=1e-12)
 
 
 def test_a_driver_without_its_method_is_refused() -> None:

@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mpmath
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -22,9 +23,11 @@ import pytest
 import scipy.stats
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from mpmath import mp, mpf
 from pyarrow import parquet
 
 from copem_replay import cli
+from copem_replay.braking.driver import Reaction
 from copem_replay.braking.verdict import judge
 from copem_replay.check import problems, read_logs
 from copem_replay.detect import detect
@@ -37,6 +40,7 @@ from copem_replay.replay import Replay, listen, prepare
 from copem_replay.run import Result, run
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
 from copem_replay.summary import summary
+from copem_replay.tracks import Float
 from experiments import changed, drive, source_of
 from scenes import Thing, driving, experiment, recording, standing
 
@@ -177,12 +181,12 @@ def ms(time_s: float) -> int:
 def in_closed_form(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, Times]:
     """What the package says, object by object."""
     result = {}
-    for object_ix, (time_s, probability) in zip(ready.looks.object_ix, distributions(ready, plan, name), strict=True):
-        assert (np.diff(time_s) > 0).all()
-        assert (probability >= -1e-15).all()
-        times: Times = {ms(t): float(p) for t, p in zip(time_s, probability, strict=True)}
-        assert len(times) == len(time_s)
-        result[ready.scene.object_ids[object_ix]] = {**times, NEVER: 1 - sum(times.values())}
+    for object_ix, of in zip(ready.looks.object_ix, distributions(ready, plan, name), strict=True):
+        assert (np.diff(of.time_s) > 0).all()
+        assert (of.probability >= 0).all()
+        times: Times = {ms(t): float(p) for t, p in zip(of.time_s, of.probability, strict=True)}
+        assert len(times) == len(of.time_s)
+        result[ready.scene.object_ids[object_ix]] = {**times, NEVER: math.exp(of.log_never)}
     return result
 
 
@@ -350,11 +354,12 @@ def test_the_truth_is_certain() -> None:
             units={},
             measure={"onset": {"kind": "appears"}, "confirm": {"hits": hits, "of": of}},
         )
-        (time_s, probability), *others = distributions(ready, plan, "GT")
+        of, *others = distributions(ready, plan, "GT")
         assert not others
-        assert ms(time_s[0]) == 500
-        assert [ms(t) for t, p in zip(time_s, probability, strict=True) if p > 0] == [known]
-        assert probability.sum() == 1
+        assert ms(of.time_s[0]) == 500
+        assert [ms(t) for t, p in zip(of.time_s, of.probability, strict=True) if p > 0] == [known]
+        assert of.probability.sum() == 1
+        assert of.log_never == -math.inf
 
 
 # -------------------------------------------------------------------------------------------------- by hand
@@ -381,11 +386,16 @@ def exact(plan: Experiment, log: Recording) -> pd.DataFrame:
     return exact_table(prepare(log, plan), plan)
 
 
+def near(values: list[float]) -> Any:
+    """The same to rounding, be they ever so small."""
+    return pytest.approx(values, rel=1e-13, abs=0)
+
+
 class TestByHand:
     def test_heads_or_tails(self) -> None:
         rows = exact(masts(1), one_walker())
-        assert rows["probability"].tolist() == [0.5 ** (k + 1) for k in range(11)] + [0.5**11]
-        assert rows["incidence"].tolist()[:-1] == [1 - 0.5 ** (k + 1) for k in range(11)]
+        assert rows["probability"].tolist() == near([0.5 ** (k + 1) for k in range(11)] + [0.5**11])
+        assert rows["incidence"].tolist()[:-1] == near([1 - 0.5 ** (k + 1) for k in range(11)])
         assert rows["detection_s"].tolist()[:-1] == pytest.approx([0.1 * k for k in range(11)])
         assert rows["time_to_detection_s"].tolist()[:-1] == pytest.approx([0.1 * k for k in range(11)])
         assert rows["distance_at_detection_m"].tolist()[:-1] == [20] * 11
@@ -420,28 +430,28 @@ class TestByHand:
         rows = exact(plan, one_walker())
         known = [k for k in range(11) if 0.1 * k + latency <= 1 + 1e-9]
         assert rows["detection_s"].tolist()[:-1] == pytest.approx([0.1 * k + latency for k in known])
-        assert rows["probability"].tolist() == [0.5 ** (k + 1) for k in known] + [0.5 ** len(known)]
+        assert rows["probability"].tolist() == near([0.5 ** (k + 1) for k in known] + [0.5 ** len(known)])
 
     def test_latency_of_one_of_two(self) -> None:
         """One at once, the other 0.25 s late: it adds to none of the ego's instants, but comes in between."""
         plan = masts(2, configurations={"all": {"units": "all", "latency_s": {"m0": 0.0, "m1": 0.25}}})
         rows = exact(plan, one_walker())
         assert [round(t, 9) for t in rows["detection_s"][:6]] == [0, 0.1, 0.2, 0.25, 0.3, 0.35]
-        assert rows["probability"].tolist()[:6] == [2.0 ** -(k + 1) for k in range(6)]
+        assert rows["probability"].tolist()[:6] == near([2.0 ** -(k + 1) for k in range(6)])
 
     def test_two_heads_in_a_row(self) -> None:
         """Of 2ⁿ ways to toss n times Fibonacci's (n − 1)-th number end in the first two heads in a row."""
         plan = masts(1, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 2}})
         rows = exact(plan, one_walker())
         fibonacci = [0, 1, 1, 2, 3, 5, 8, 13, 21, 34, 55]
-        assert rows["probability"].tolist()[:-1] == [f / 2 ** (n + 1) for n, f in enumerate(fibonacci)]
+        assert rows["probability"].tolist()[:-1] == near([f / 2 ** (n + 1) for n, f in enumerate(fibonacci)])
         assert rows["probability"].tolist()[-1] == pytest.approx(233 / 2**11)  # no two in a row: again Fibonacci's
 
     def test_two_of_three(self) -> None:
         """Of tosses, by their number: HH; HTH, THH; TTHH, THTH; HTTHH, TTTHH, TTHTH."""
         plan = masts(1, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 3}})
         rows = exact(plan, one_walker())
-        assert [p * 2 ** (n + 1) for n, p in enumerate(rows["probability"][:5])] == [0, 1, 2, 2, 3]
+        assert [p * 2 ** (n + 1) for n, p in enumerate(rows["probability"][:5])] == near([0, 1, 2, 2, 3])
 
     def test_what_was_captured_before_the_onset(self) -> None:
         """The onset is at 0.42 s; counted from the beginning the times are negative at first."""
@@ -450,11 +460,11 @@ class TestByHand:
         assert rows["time_to_detection_s"].tolist()[:-1] == pytest.approx([0.08 + 0.1 * k for k in range(6)])
         rows = exact(masts(1, measure=onset | {"count_earlier": True}), one_walker())
         assert rows["time_to_detection_s"].tolist()[:-1] == pytest.approx([-0.42 + 0.1 * k for k in range(11)])
-        assert rows["probability"].tolist()[-1] == 0.5**11
+        assert rows["probability"].tolist()[-1] == pytest.approx(0.5**11, rel=1e-13)
 
     def test_who_leaves(self) -> None:
         rows = exact(masts(1), one_walker(lambda t: 0.25 < t < 0.55))
-        assert rows["probability"].tolist() == [0.5, 0.25, 0.125, 0.125]
+        assert rows["probability"].tolist() == near([0.5, 0.25, 0.125, 0.125])
         assert set(rows["ended_by"]) == {"object_left"}
 
     def test_nobody_lists(self) -> None:
@@ -499,6 +509,74 @@ class TestByHand:
         asked = run(masts(1), [one_walker()])
         pd.testing.assert_frame_equal(asked.table, result.table)
         pd.testing.assert_frame_equal(asked.summary[list(result.summary)], result.summary)
+
+
+class TestTails:
+    def test_never_where_one_minus_the_rest_is_nothing(self) -> None:
+        """Two masts, eleven lists each, odds of 9 : 1: never with 10⁻²², at half the odds with (2/11)²²."""
+        result = run(masts(2, 0.9), [one_walker()])
+        assert result.exact is not None
+        never, row = result.exact.iloc[-1], result.summary.iloc[0]
+        assert never["probability"] == pytest.approx(1e-22, rel=1e-12)
+        for found in (never, row):
+            assert found["miss_log10"] == pytest.approx(-22, rel=1e-13)
+            assert found["miss_per_logit"] == pytest.approx(-22 * 0.9, rel=1e-13)
+            assert found["miss_log10_half_odds"] == pytest.approx(22 * math.log10(2 / 11), rel=1e-13)
+
+    def test_a_logarithm_where_there_is_no_double_any_more(self) -> None:
+        row = run(masts(110, 0.999), [one_walker()]).summary.iloc[0]
+        assert row["miss_log10"] == pytest.approx(-3 * 110 * 11, rel=1e-12)
+
+    def test_when_two_of_two_are_asked_for(self) -> None:
+        """Three lists: all miss but the middle one, or but one at an end, or all, or but both ends."""
+        there = one_walker(lambda t: t < 0.25)
+        plan = masts(1, 0.999, measure={"onset": {"kind": "appears"}, "confirm": {"hits": 2, "of": 2}, "exact": True})
+        row = run(plan, [there]).summary.iloc[0]
+        p, q = 0.999, 1 - 0.999
+        assert row["miss_log10"] == pytest.approx(math.log10(q**3 + 3 * p * q**2 + p * p * q), rel=1e-13)
+
+    def test_over_objects(self) -> None:
+        """b has left after two lists, a after four; odds of 9 : 1: the mean of 10⁻⁴ and 10⁻² hangs on b's lists."""
+        things = [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("a", "pedestrian", standing(20, 0), lambda t: t < 0.35),
+            Thing("b", "pedestrian", standing(30, 0), lambda t: t < 0.15),
+        ]
+        row = run(masts(1, 0.9), [recording(things, until_s=1.0)]).summary.iloc[0]
+        assert row["miss_log10"] == pytest.approx(math.log10((1e-4 + 1e-2) / 2), rel=1e-13)
+        assert row["miss_per_logit"] == pytest.approx(-(1e-4 * 3.6 + 1e-2 * 1.8) / (1e-4 + 1e-2), rel=1e-12)
+        half = math.log10(((2 / 11) ** 4 + (2 / 11) ** 2) / 2)
+        assert row["miss_log10_half_odds"] == pytest.approx(half, rel=1e-13)
+
+    def test_where_some_are_certain(self) -> None:
+        """Over all looks, those that cannot miss included; where none can, there is no logarithm."""
+        things = [Thing("ego", "car", standing(0, 0)), Thing("a", "pedestrian", standing(20, 0))]
+        log = recording([*things, Thing("b", "car", standing(30, 0))], until_s=1.0)
+        couples = [
+            {"when": {"classes": ["car"]}, "detection": {"kind": "constant", "probability": 1.0}},
+            {"detection": {"kind": "constant", "probability": 0.9}},
+        ]
+        both = {"all": {"units": "all"}, "GT": {"units": "truth"}}
+        rows = run(masts(1, pems={"p": couples}, configurations=both), [log]).summary.set_index("configuration")
+        assert rows.loc["all", "miss_log10"] == pytest.approx(math.log10(1e-11 / 2), rel=1e-13)
+        assert rows.loc["all", "miss_per_logit"] == pytest.approx(-9.9, rel=1e-13)
+        assert rows.loc["GT", ["miss_log10", "miss_per_logit", "miss_log10_half_odds"]].isna().all()
+
+    def test_who_may_be_there(self) -> None:
+        """A mast's lists miss with 10⁻¹¹; a car at 0.5 that is there misses with 10⁻¹¹ more, else with all of it."""
+        things = [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("v", "car", standing(0, 9)),
+            Thing("a", "pedestrian", standing(20, 0)),
+        ]
+        units = {
+            "mast": {"at": [20, 5], "height_m": 5.0, "pem": "p"},
+            "fleet": {"on": {"classes": ["car"], "share": 0.5}, "pem": "p"},
+        }
+        measure = {"onset": {"kind": "appears"}, "objects": {"classes": ["pedestrian"]}, "exact": True}
+        row = run(masts(1, 0.9, units=units, measure=measure), [recording(things, until_s=1.0)]).summary.iloc[0]
+        assert row["miss_log10"] == pytest.approx(-11 + math.log10(0.5 + 0.5e-11), rel=1e-13)
+        assert row["miss_per_logit"] == pytest.approx(-9.9 * (1 + 1e-11 / (1 + 1e-11)), rel=1e-13)
 
 
 @SOME
@@ -813,6 +891,53 @@ class TestPassing:
         part = result.exact[(result.exact["configuration"] == "all") & result.exact["conflict"]]
         assert part["pass_probability"].tolist() == pytest.approx([1] * 29 + [0] * (len(part) - 29), abs=1e-12)
 
+    def test_failing_is_not_one_minus_passing(self) -> None:
+        """With 0.9 instead: the first 29 lists miss him with 10⁻²⁹."""
+        rows = self.meeting({"kind": "constant", "delay_s": 0.25}, 0.9).summary.set_index("configuration")
+        assert rows.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11)
+        assert rows.loc["GT", "fail_share_exact"] == 0
+        assert rows.loc["all", "miss_log10"] == pytest.approx(-51, rel=1e-12)
+
+    @pytest.mark.parametrize(
+        "reaction",
+        [
+            {"kind": "gamma", "shape": 1.41, "mean_s": 0.05},
+            {"kind": "gamma", "shape": 400.0, "mean_s": 1.0},
+            {"kind": "lognormal", "median_s": 0.05, "sigma": 0.12},
+        ],
+    )
+    def test_failing_by_the_reactions_far_tail(self, reaction: dict[str, Any]) -> None:
+        """Known at 0 s, as by the truth, it fails when the reaction takes longer than the 3.1 s that are left.
+
+        Who may miss him fails with the mean of that over the instants at which he may be known, in 60 digits.
+        """
+        result = self.meeting(reaction, 0.9)
+        (between_s,) = result.replays[0].passing_s.values()
+        assert between_s[0, 1] == pytest.approx(3.1, abs=1e-4)
+        rows = result.summary.set_index("configuration")
+        with mp.workdps(60):
+            last_s, never = mpf(between_s[0, 1]), mpf(1 - 0.9) ** 51
+            chance = [(mpf(0.9) * mpf(1 - 0.9) ** k, longer(reaction, last_s - mpf(k) / 10)) for k in range(51)]
+            expected = sum(p * fails for p, fails in chance) + never
+            assert float(longer(reaction, last_s)) < 1e-20
+            assert rows.loc["GT", "fail_share_exact"] == pytest.approx(float(longer(reaction, last_s)), rel=1e-9, abs=0)
+            assert rows.loc["all", "fail_share_exact"] == pytest.approx(float(expected), rel=1e-9, abs=0)
+        assert (rows["pass_share_exact"] == 1).all()
+
+    def test_failing_with_a_reaction_that_gives_no_survival(self) -> None:
+        """At 0.9 it fails with 10⁻²⁹, of which nothing is known; at ½ with 2⁻²⁹."""
+        own = {"kind": "test_exact:Prompt"}
+        result = self.meeting(own, 0.9)
+        rows = result.summary.set_index("configuration")
+        assert rows["fail_share_exact"].isna().all()
+        assert result.exact is not None
+        part = result.exact[result.exact["conflict"] & (result.exact["configuration"] == "all")]
+        assert part["fail_probability"].isna().tolist() == [True] * 29 + [False] * 23
+        rows = self.meeting(own, 0.5).summary.set_index("configuration")
+        assert rows.loc["all", "fail_share_exact"] == pytest.approx(2.0**-29, rel=1e-6)
+        told = self.meeting({"kind": "test_exact:Told"}, 0.9).summary.set_index("configuration")
+        assert told.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11)
+
     def test_by_hand_with_chance_in_the_reaction(self) -> None:
         """With median 0.6 s: known at t it passes with Φ(ln((3.1 − t) / 0.6) / σ)."""
         result = self.meeting({"kind": "lognormal", "median_s": 0.6, "sigma": 0.5})
@@ -839,6 +964,30 @@ class TestPassing:
         assert rows.loc["all", "pass_share"] == 1
 
 
+class Prompt(Reaction):
+    """A reaction of one's own: 0.25 s."""
+
+    def delays(self, uniform: Float) -> Float:
+        return np.full(len(uniform), 0.25)
+
+
+class Told(Prompt):
+    """It says how probably it takes longer, too."""
+
+    def survival(self, delay_s: Float) -> Float:
+        return np.where(delay_s < 0.25, 1.0, 0.0)
+
+
+def longer(reaction: dict[str, Any], delay_s: Any) -> Any:
+    """The probability that it takes longer, of mpmath."""
+    if delay_s <= 0:
+        return mpf(1)
+    if reaction["kind"] == "gamma":
+        shape = mpf(reaction["shape"])
+        return mpmath.gammainc(shape, delay_s * shape / mpf(reaction["mean_s"]), mpmath.inf, regularized=True)
+    return mpmath.ncdf(-mpmath.log(delay_s / mpf(reaction["median_s"])) / mpf(reaction["sigma"]))
+
+
 @pytest.mark.parametrize("braking", [False, True])
 def test_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], braking: bool
@@ -857,13 +1006,20 @@ def test_the_file(
         "log": text, "configuration": text, "object_id": text, "object_class": text, "onset_s": number,
         "detection_s": number, "probability": number, "incidence": number, "time_to_detection_s": number,
         "distance_at_detection_m": number, "gap_at_detection_m": number, "ended_s": number, "ended_by": text,
+        "miss_log10": number, "miss_per_logit": number, "miss_log10_half_odds": number,
     }  # fmt: skip
-    more = {"conflict": pa.bool_(), "pass_probability": number} if braking else {}
+    more = {"conflict": pa.bool_(), "pass_probability": number, "fail_probability": number} if braking else {}
     assert {f.name: f.type for f in table.schema} == columns | more
     rows = table.to_pylist()
     # From 1 s on, when the car is 60 m away, to 3 s; the lists of coPEM half a second later.
     assert [sum(r["configuration"] == name for r in rows) for name in ("GT", "PEM", "coPEM")] == [22, 22, 17]
     for row in rows:
+        of_never = [row[name] for name in ("miss_log10", "miss_per_logit", "miss_log10_half_odds")]
+        if row["detection_s"] is not None or row["configuration"] == "GT":
+            assert of_never == [None] * 3, "of never alone, and null where detection is certain"
+        else:  # lists that each hold it with ½, with half the odds 1 : 2
+            count = {"PEM": 21, "coPEM": 32}[row["configuration"]]
+            assert of_never == near([count * math.log10(1 / 2), -count / 2, count * math.log10(2 / 3)])
         if row["detection_s"] is None:
             lacking = ("incidence", "time_to_detection_s", "distance_at_detection_m", "gap_at_detection_m")
             assert [row[name] for name in lacking] == [None] * 4
@@ -876,7 +1032,7 @@ def test_the_file(
             assert row["probability"] == pytest.approx(0.75 * 0.25**k)
             assert row["distance_at_detection_m"] == pytest.approx(55 - k)
         if braking:
-            assert (row["conflict"], row["pass_probability"]) == (False, None)
+            assert [row[name] for name in ("conflict", "pass_probability", "fail_probability")] == [False, None, None]
 
 
 # -------------------------------------------------------------------------------------- summaries of exact times
@@ -961,20 +1117,31 @@ class TestSummary:
             times = data.draw(st.lists(marks, min_size=16, max_size=16))
             base = {"log": "x", "configuration": "c", "object_id": str(k), "onset_s": 0.0, "ended_s": ended_s,
                     "ended_by": ended_by}  # fmt: skip
-            for t, count in Counter(times).items():
+            # Of each look there is a row for never, be it that it cannot be.
+            for t, count in ({NEVER: 0} | Counter(times)).items():
                 at = math.nan if t is None else t
                 row = base | {
                     "detection_s": at,
                     "time_to_detection_s": at,
                     "distance_at_detection_m": math.nan if t == 0.25 and k == 0 else 10 - at,
                 }
-                rows.append(row | {"probability": count / 16})
+                of_never = dict.fromkeys(("miss_log10", "miss_per_logit", "miss_log10_half_odds"), math.nan)
+                if t is None and count:
+                    of_never |= {"miss_log10": math.log10(count / 16), "miss_per_logit": -k, "miss_log10_half_odds": 0}
+                rows.append(row | {"probability": count / 16} | of_never)
                 table += [row | {"detected": t is not None, "run": 0}] * count
         rates = {"c": None}
         frame = pd.DataFrame(table)
         (row,) = summary(frame, ["c"], rates, seed=0, horizon_s=2.0, exact=pd.DataFrame(rows))[0].to_dict("records")
         for name in ("detected_share", "ttd_rmst_s"):
             assert row[f"{name}_exact"] == pytest.approx(row[name], abs=1e-12)
+        missed = frame.loc[~frame["detected"], "object_id"].astype(float)
+        if len(missed):
+            assert row["miss_log10"] == pytest.approx(math.log10(len(missed) / (16 * looks)), abs=1e-12)
+            assert row["miss_per_logit"] == pytest.approx(-missed.mean(), abs=1e-12), "by how probable each is"
+            assert row["miss_log10_half_odds"] == pytest.approx(math.log10(missed.nunique() / looks), abs=1e-12)
+        else:
+            assert [row[n] for n in ("miss_log10", "miss_per_logit", "miss_log10_half_odds")] == [None] * 3
         for name in ("ttd_p5_s", "ttd_median_s", "ttd_p95_s", "dad_median_m", "dad_p5_m"):
             assert row[f"{name}_exact"] == row[name] or (row[f"{name}_exact"] is None and row[name] is None), name
 

@@ -579,7 +579,7 @@ class TestClosedForm:
         def rows(units: dict[str, Any], name: str) -> list[tuple[float, float]]:
             wanted = plan(units, configurations=CONFIGURATIONS)
             found = distributions(prepare(log, wanted), wanted, name)[0]
-            return [(t, p) for t, p in zip(*map(np.ndarray.tolist, found), strict=True) if p > 0]
+            return [(t, p) for t, p in zip(found.time_s.tolist(), found.probability.tolist(), strict=True) if p > 0]
 
         assert rows({"ego": EGO, "fleet": some(0.0)}, "all") == rows({"ego": EGO, "fleet": some(0.0)}, "ego")
         assert rows({"ego": EGO, "fleet": some(0.0)}, "fleet") == []

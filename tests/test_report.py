@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 import shutil
 import sys
@@ -24,7 +25,7 @@ from copem_replay.plot.appearance import appearances
 from copem_replay.report import write_report
 from copem_replay.report.drawing import rgb
 from copem_replay.report.markup import Html, tag
-from copem_replay.report.never import misses
+from copem_replay.report.never import misses, powers
 from copem_replay.report.page import page
 from copem_replay.report.study import load_study
 from copem_replay.report.waterfall import FUSION, HIDDEN, IN_SIGHT, SINCE_CAPTURED, TRANSPORT, UNTIL_CAPTURED, stages
@@ -276,6 +277,43 @@ class TestNeverDetected:
             ["drive", "2", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
             ["drive", "3", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
         ]
+
+    def test_without_a_draw(self, tmp_path: Path) -> None:
+        """`half` has 46 lists of the one in the way, 14 of which are soon enough; odds of 1 : 1, halved 1 : 2."""
+        exact = (EVERY, "measure: {exact: true, objects: {ids: [2]}, onset")
+        folder = replayed(tmp_path, changed(exact))
+        rows = summary_rows(folder)
+        assert float(rows["half"]["miss_log10"]) == pytest.approx(46 * math.log10(1 / 2))
+        assert float(rows["half"]["miss_per_logit"]) == pytest.approx(-23)
+        assert float(rows["half"]["miss_log10_half_odds"]) == pytest.approx(46 * math.log10(2 / 3))
+        assert float(rows["half"]["fail_share_exact"]) == pytest.approx(2.0**-14)
+        words = Page(page(load_study(folder))).words
+        certain = "the detection of every measured object is certain. The ego fails with probability"
+        assert f"GT: {certain} 0." in words
+        assert f"hit: {certain} 1." in words
+        assert (
+            "half: a measured object is never detected with probability 1.4·10−14; were the odds of every detection "
+            "half of what the PEM says, that would be 7.9·10−9. The ego fails with probability 6.1·10−5."
+        ) in words
+        assert "never: no list ever holds a measured object. The ego fails with probability 1." in words
+
+    def test_nothing_of_it_where_it_was_not_asked_for(self, read: Page) -> None:
+        assert "Without a draw" not in read.words
+
+    @pytest.mark.parametrize(
+        ("log10", "shown"),
+        [
+            (0.0, "1"),
+            (math.log10(0.0123), "0.0123"),
+            (-3.5, "3.2·10<sup>−4</sup>"),
+            (-22.0, "10<sup>−22</sup>"),
+            (-22.000000000000004, "10<sup>−22</sup>"),
+            (math.log10(9.96) - 30, "10<sup>−29</sup>"),
+            (-3630.3010299956640, "5.0·10<sup>−3631</sup>"),
+        ],
+    )
+    def test_numbers_of_any_size(self, log10: float, shown: str) -> None:
+        assert powers(log10) == shown
 
     def test_counts_runs_by_log_object_and_configuration(self) -> None:
         rows = pd.DataFrame(

@@ -101,7 +101,10 @@ class Scenario:
         until_s = np.interp(-1 / fitted.a_max_mps2, -1 / np.array(DECELERATIONS_MPS2), latest_s)
         between_s = np.array([[float(self.replay.looks.onset_s[0]), until_s]])
         reaction = GammaReaction(shape=fitted.shape, mean_s=fitted.mean_s)
-        return {name: float(p @ pass_probability(between_s, t, reaction)) for name, (t, p) in self.times.items()}
+        return {
+            name: float(of.probability @ pass_probability(between_s, of.time_s, reaction))
+            for name, of in self.times.items()
+        }
 
 
 def misfit(rates: Mapping[str, float]) -> float:

@@ -17,6 +17,8 @@ from copem_replay.tracks import Float
 
 _SHORTEST_S = 0.05
 """A deceleration that builds up faster than this is taken to be there at once (chosen: 5 steps)."""
+UNRESOLVED = 1e-15
+"""Shares below this are not told where only the inverse of a distribution is known: its numbers end 10⁻¹⁶ below 1."""
 
 
 class Reaction(Component, ABC):
@@ -25,6 +27,14 @@ class Reaction(Component, ABC):
     @abstractmethod
     def delays(self, uniform: Float) -> Float:
         """(K,) seconds for uniform numbers (K,) in (0, 1): the inverse of their distribution, never decreasing."""
+
+    def survival(self, delay_s: Float) -> Float | None:
+        """(K,) probability that it takes longer than `delay_s (K,)` ≥ 0, to the far tail. None: not known.
+
+        It need not be given. With it failures rarer than 10⁻¹⁵ have a probability; `delays` has to hold for numbers
+        down to 10⁻³⁰⁰, then.
+        """
+        return None
 
 
 class ConstantReaction(Reaction):
@@ -36,6 +46,10 @@ class ConstantReaction(Reaction):
     def delays(self, uniform: Float) -> Float:
         """(K,) all the same."""
         return np.full(len(uniform), self.delay_s)
+
+    def survival(self, delay_s: Float) -> Float:
+        """(K,) 1 before the delay, 0 from then on."""
+        return np.where(delay_s < self.delay_s, 1.0, 0.0)
 
 
 class GammaReaction(Reaction):
@@ -52,6 +66,13 @@ class GammaReaction(Reaction):
         result: Float = gammaincinv(self.shape, uniform) * (self.mean_s / self.shape)
         return result
 
+    def survival(self, delay_s: Float) -> Float:
+        """(K,) the upper regularised incomplete gamma function."""
+        from scipy.special import gammaincc
+
+        result: Float = gammaincc(self.shape, delay_s / (self.mean_s / self.shape))
+        return result
+
 
 class LognormalReaction(Reaction):
     """Log-normal delays, by median and the standard deviation of their logarithm."""
@@ -65,6 +86,16 @@ class LognormalReaction(Reaction):
         from scipy.special import ndtri
 
         result: Float = self.median_s * np.exp(self.sigma * ndtri(uniform))
+        return result
+
+    def survival(self, delay_s: Float) -> Float:
+        """(K,) the normal distribution of the logarithm."""
+        from scipy.special import ndtr
+
+        if self.sigma == 0:
+            return np.where(delay_s < self.median_s, 1.0, 0.0)
+        with np.errstate(divide="ignore", over="ignore"):  # no delay, or hardly any sigma: ±∞
+            result: Float = ndtr(np.log(self.median_s / delay_s) / self.sigma)
         return result
 
 
@@ -124,6 +155,48 @@ def delays_of(reaction: Reaction, uniform: Float) -> Float:
     none = ~((found >= 0) & np.isfinite(found))
     if none.any():
         raise wrong(reaction, where, f"delays(uniform): expected seconds ≥ 0, found {found[none][0]}", "delays")
+    return found
+
+
+_TRIED = np.array([0.01, 0.1, 0.5, 0.9, 0.99])
+"""Numbers at which the survival of a reaction is held against its delays (chosen)."""
+
+
+def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
+    """(K,) how probably a reaction takes longer than `delay_s (K,)`, checked. None: it does not say.
+
+    Raises InputError when it is no probability, or not of the delays that the same reaction gives.
+    """
+    where = "braking.driver.reaction"
+    what = f"{where}: {reaction.kind}: survival(delay_s)"
+
+    def survival(of_s: Float) -> Float | None:
+        given = asked(reaction, where, lambda: reaction.survival(of_s))
+        if given is None:
+            return None
+        found = asked(reaction, where, lambda: np.asarray(given, dtype=float))
+        if found.shape != of_s.shape:
+            raise InputError(f"{what}: expected shape {of_s.shape}, found {found.shape}")
+        wrong = ~((found >= 0) & (found <= 1))
+        if wrong.any():
+            raise InputError(f"{what}: expected probabilities 0 … 1, found {found[wrong][0]}")
+        return found
+
+    found = survival(delay_s)
+    if found is None:
+        return None
+    # Whatever the distribution, P(D > d) ≤ 1 − u ≤ P(D ≥ d): with d a hair aside for rounding.
+    at_s = delays_of(reaction, _TRIED)
+    for hair, sign in ((1e-9, 1), (-1e-9, -1)):
+        there = survival(at_s * (1 + hair))
+        assert there is not None
+        off = np.flatnonzero((sign * (there - (1 - _TRIED)) > 1e-6) & (at_s > 0))
+        if len(off):
+            k = off[0]
+            raise InputError(
+                f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {there[k]:g}"
+            )
     return found
 
 

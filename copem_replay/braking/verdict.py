@@ -16,7 +16,7 @@ import numpy as np
 
 from copem_replay.braking.blocked import required
 from copem_replay.braking.boxes import nearest
-from copem_replay.braking.driver import Driver, Reaction, deceleration_of, delays_of
+from copem_replay.braking.driver import UNRESOLVED, Driver, Reaction, deceleration_of, delays_of, survival_of
 from copem_replay.braking.encounter import Encounter
 from copem_replay.tracks import Bool, Float
 
@@ -150,22 +150,61 @@ def pass_probability(between_s: Float, known_s: Float, reaction: Reaction) -> Fl
 
     `between_s (I, 2)`: beginnings of braking that pass, from `passing`.
     """
-    if not len(between_s):
-        return np.zeros(len(known_s))
-    delay_s = between_s - np.where(np.isfinite(known_s), known_s, 0.0)[:, None, None]
-    reached = _share_within(reaction, delay_s.ravel()).reshape(len(known_s), -1, 2)
-    probability: Float = (reached[:, :, 1] - reached[:, :, 0]).sum(axis=1)
+    probability, _ = _begins_in(between_s, known_s, reaction)
     return np.where(np.isfinite(known_s), probability, 0.0)
 
 
-def _share_within(reaction: Reaction, delay_s: Float) -> Float:
-    """Probability (K,) that a reaction takes at most `delay_s (K,)`: its inverse distribution inverted, by halves."""
-    low, high = np.zeros(len(delay_s)), np.ones(len(delay_s))
-    finite = np.isfinite(delay_s)
-    for _ in range(60):
-        u = (low + high) / 2
-        u = np.clip(u, 2.0**-53, 1 - 2.0**-53)
-        within = delays_of(reaction, u) <= delay_s
-        low, high = np.where(within, u, low), np.where(within, high, u)
-    result = np.where(high <= 2.0**-52, 0.0, np.where(low >= 1 - 2.0**-52, 1.0, (low + high) / 2))
-    return np.where(finite, result, np.where(delay_s > 0, 1.0, 0.0))
+def fail_probability(between_s: Float, known_s: Float, reaction: Reaction) -> Float:
+    """Probability (K,) not to pass, the same way: of the beginnings between those that pass, not 1 − that to pass.
+
+    NaN below `UNRESOLVED` where the reaction gives no survival function.
+    """
+    outside = np.concatenate([[-np.inf], between_s.ravel(), [np.inf]]).reshape(-1, 2)
+    probability, resolved = _begins_in(outside, known_s, reaction)
+    if not resolved:
+        probability = np.where(probability < UNRESOLVED, np.nan, probability)
+    return np.where(np.isfinite(known_s), probability, 1.0)
+
+
+def _begins_in(between_s: Float, known_s: Float, reaction: Reaction) -> tuple[Float, bool]:
+    """Probability (K,) that braking begins within intervals (I, 2), and whether that holds in the far tail, too."""
+    if not len(between_s):
+        return np.zeros(len(known_s)), True
+    delay_s = between_s - np.where(np.isfinite(known_s), known_s, 0.0)[:, None, None]
+    within, beyond, resolved = _tails(reaction, delay_s.ravel())
+    low, high = within.reshape(delay_s.shape)[:, :, 0], within.reshape(delay_s.shape)[:, :, 1]
+    later, latest = beyond.reshape(delay_s.shape)[:, :, 0], beyond.reshape(delay_s.shape)[:, :, 1]
+    # Of the two tails the smaller one: its differences lose least.
+    probability: Float = np.where(low < 0.5, high - low, later - latest).sum(axis=1)
+    return probability, resolved
+
+
+def _tails(reaction: Reaction, delay_s: Float) -> tuple[Float, Float, bool]:
+    """Probabilities (K,) that a reaction takes at most, and longer than, `delay_s (K,)`; whether both hold far out."""
+    within = np.where(delay_s > 0, 1.0, 0.0)
+    some = np.isfinite(delay_s) & (delay_s >= 0)
+    of_s = delay_s[some]
+    survival = survival_of(reaction, of_s)
+    if survival is None:
+        within[some] = _share_within(reaction, of_s, -53)
+        return within, 1 - within, False
+    beyond = 1 - within
+    beyond[some] = survival
+    within[some] = 1 - survival
+    early = np.flatnonzero(some)[survival > 0.5]
+    within[early] = _share_within(reaction, delay_s[early], -1022)
+    return within, beyond, True
+
+
+def _share_within(reaction: Reaction, delay_s: Float, least: int) -> Float:
+    """Probability (K,) that a reaction takes at most `delay_s (K,)`, 0 below 2 to the power of `least`.
+
+    Its inverse distribution inverted: the exponent of the probability is found by halves.
+    """
+    low, high = np.full(len(delay_s), float(least)), np.zeros(len(delay_s))
+    for _ in range(70 if len(delay_s) else 0):
+        middle = (low + high) / 2
+        within = delays_of(reaction, np.minimum(np.exp2(middle), 1 - 2.0**-53)) <= delay_s
+        low, high = np.where(within, middle, low), np.where(within, high, middle)
+    share: Float = np.exp2((low + high) / 2)
+    return np.where(low == least, 0.0, np.where(high == 0, 1.0, share))

@@ -1,12 +1,14 @@
-"""Who was never detected, by name."""
+"""Who was never detected, by name; and how probable that is, where it is known without a draw."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import pandas as pd
 
-from copem_replay.report.markup import Html, joined, table, tag
+from copem_replay.report.markup import Html, joined, listed, table, tag
 from copem_replay.report.study import Study
 from copem_replay.table import cell
 from copem_replay.wording import counted
@@ -34,6 +36,44 @@ def never_detected(study: Study) -> Html:
     if len(rows) > _OPEN:
         whole = tag("details", tag("summary", f"All {len(rows)} rows"), whole)
     return joined([tag("p", said), whole])
+
+
+def without_a_draw(study: Study) -> Html:
+    """How probably an object is never detected, what that hangs on, and how probably the ego fails; a line each."""
+    rows = study.results.summary
+    if "miss_log10" not in rows:
+        return Html()
+    above = "What the PEM implies if its lists err independently of each other, which small numbers hang on most."
+    lines = listed(_exactly(row) for row in rows.to_dict("records"))
+    return joined([tag("h3", "Without a draw"), tag("p", above), lines])
+
+
+def _exactly(row: dict[str, Any]) -> Html:
+    missed, half, fails = (
+        float(row.get(name, math.nan)) for name in ("miss_log10", "miss_log10_half_odds", "fail_share_exact")
+    )
+    said: list[str] = [tag("b", str(row["configuration"])), ": "]
+    if math.isnan(missed):
+        said.append("the detection of every measured object is certain")
+    elif missed == 0:
+        said.append("no list ever holds a measured object")
+    else:
+        said += [
+            "a measured object is never detected with probability ", powers(missed),
+            "; were the odds of every detection half of what the PEM says, that would be ", powers(half),
+        ]  # fmt: skip
+    if not math.isnan(fails):
+        said += [". The ego fails with probability ", powers(math.log10(fails)) if fails > 0 else "0"]
+    return joined([*said, "."])
+
+
+def powers(log10: float) -> Html:
+    """`0.0123`, `4.2·10⁻²²`: a number by its decadic logarithm, however small or large."""
+    if -3 <= log10 < 4:
+        return Html(cell(math.pow(10, log10)))
+    mantissa, _, exponent = f"{math.pow(10, log10 - math.floor(log10)):.1e}".partition("e")
+    power = tag("sup", f"{math.floor(log10) + int(exponent)}".replace("-", "−"))
+    return joined(["10" if mantissa == "1.0" else f"{mantissa}·10", power])
 
 
 def misses(rows: pd.DataFrame) -> pd.DataFrame:

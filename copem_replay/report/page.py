@@ -12,7 +12,7 @@ from copem_replay.report.described import configurations, question, setting
 from copem_replay.report.distances import distances
 from copem_replay.report.drawing import Drawn, swatch
 from copem_replay.report.markup import Html, joined, tag, text
-from copem_replay.report.never import never_detected
+from copem_replay.report.never import never_detected, without_a_draw
 from copem_replay.report.provenance import provenance
 from copem_replay.report.study import Study
 from copem_replay.report.sweeps import sweeps
@@ -46,7 +46,7 @@ def page(study: Study) -> str:
             figures += drawn
             above = [_key(study)] if k == 0 and len(study.names) > 1 else []
             sections.append(_section(f"figures-{k}", title, *above, html))
-        sections.append(_section("missed", "Never detected", never_detected(study)))
+        sections.append(_section("missed", "Never detected", never_detected(study), without_a_draw(study)))
     sections.append(_section("provenance", "Where this comes from", provenance(study)))
     title = f"When was it known? {', '.join(file.name for file in study.results.logs)}"
     head = tag("header", tag("h1", "When was it known?"), tag("p", question(study), class_="question"), answer(study))
