@@ -40,7 +40,7 @@ FEWEST_EACH = 10
 _CELLS = 4_000_000
 """Numbers held at a time (chosen: 32 MB)."""
 _ROUNDING = 1e-9
-"""So close to none or all of n is none or all."""
+"""Numbers of clusters this close are the same."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,7 @@ def effective_number(weights: Float | Int) -> float:
     weights = np.asarray(weights, dtype=float)
     if not (weights >= 0).all() or not weights.sum() > 0:
         raise ValueError("effective_number: expected weights of at least 0, and one above")
-    shares = weights / weights.sum()
-    return float(1.0 / (shares @ shares))
+    return float(weights.sum() ** 2 / (weights @ weights))
 
 
 def bootstrap_share(
@@ -222,7 +221,7 @@ def share_limits(
     low, high = bootstrap_share(successes, totals, resampled, confidence=confidence)
     n = effective_number(totals)
     k = n * float(successes.sum()) / float(totals.sum())
-    if n >= EXACT_BELOW and FEWEST_EACH <= k <= n - FEWEST_EACH:
+    if min(n - EXACT_BELOW, k - FEWEST_EACH, n - k - FEWEST_EACH) >= -_ROUNDING:
         return "bootstrap", low, high
     least, most = exact_limits(min(k, n), n, confidence=confidence)
     return "bootstrap+exact", min(low, least), max(high, most)

@@ -11,8 +11,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from compare_folders import BRAKING, Row, row, widened, write_folder
-from copem_replay.chance import Address, Dice, object_words
+from compare_folders import BRAKING, Row, limits_of, row, write_folder
 from copem_replay.compare import Comparison, compare
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 
@@ -133,18 +132,13 @@ SEED = 5
 
 
 def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]], seed: int = SEED) -> tuple[float, float]:
-    """2000 times: as many clusters as there are, drawn by the dice; the mean of all differences in them."""
-    names = sorted(clusters)
-    zeros = np.zeros(len(names), dtype=np.int64)
-    uniform = Dice(seed, "summary").uniform(
-        "bootstrap", Address(("",), zeros, object_words(names), zeros), np.arange(2000)
-    )
-    means = []
-    for resample in uniform:
-        pairs = [pair for u in resample for pair in clusters[names[int(u * len(names))]]]
-        means.append(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
-    low, high = np.quantile(means, widened(len(names)))
-    return float(low), float(high)
+    """Of resamples with as many clusters as there are, the mean of all differences in them."""
+
+    def mean(drawn: list[str]) -> float:
+        pairs = [pair for name in drawn for pair in clusters[name]]
+        return float(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
+
+    return limits_of(list(clusters), mean, seed)
 
 
 def pairs_of(times: Sequence[tuple[float, float]], **where: Any) -> list[Row]:
@@ -238,9 +232,15 @@ def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
     table = compare(folders, baseline="first:x").table
     assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
-    assert (table[["difference", "low", "high"]].fillna(0.0) == 0.0).all(axis=None)
-    assert table["difference"].notna().all()
-    assert table.loc[table["log"] == "all", "low"].notna().all()
+    assert (table["difference"] == 0.0).all()
+    table = table[table["log"] == "all"].set_index("metric")
+    # None of eight clusters differs, and of the six in conflict none: 1 − 0.025^(1/8), 1 − 0.025^(1/6).
+    for metric, limit in (("detected_share", 0.369417), ("pass_share", 0.459258)):
+        assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
+        assert table.loc[metric, "interval"] == "exact"
+    others = table.loc[["ttd_rmst_s", "dad_median_m"]]
+    assert (others["interval"] == "all clusters alike").all()
+    assert others[["low", "high", "interval_over"]].isna().all(axis=None)
 
 
 def test_the_order_of_rows_does_not_matter(tmp_path):
@@ -288,12 +288,8 @@ def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tm
     keys = sorted(sides["ideal"])
     assert time["value"] == pytest.approx(mean("late", keys))
     assert time["baseline_value"] == pytest.approx(mean("ideal", keys))
-    zeros = np.zeros(len(keys), dtype=np.int64)
-    address = Address(("",), zeros, object_words(keys), zeros)
-    uniform = Dice(SEED, "summary").uniform("bootstrap", address, np.arange(2000))
-    drawn = [[keys[int(u * len(keys))] for u in resample] for resample in uniform]
-    figures = [mean("late", some) - mean("ideal", some) for some in drawn]
-    assert (time["low"], time["high"]) == pytest.approx(tuple(np.quantile(figures, widened(6))), abs=1e-9)
+    expected = limits_of(keys, lambda drawn: mean("late", drawn) - mean("ideal", drawn), SEED)
+    assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-9)
 
 
 def test_all_metrics_of_a_pair_are_resampled_alike_or_not_at_all(tmp_path):
