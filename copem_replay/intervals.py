@@ -218,13 +218,20 @@ def share_limits(
     `bootstrap`: `bootstrap_share`, over many clusters of which enough succeed and fail; else `bootstrap+exact`: on each
     side the wider of it and the exact limits.
     """
-    low, high = bootstrap_share(successes, totals, resampled, confidence=confidence)
-    n = effective_number(totals)
-    k = n * float(successes.sum()) / float(totals.sum())
+    limits = bootstrap_share(successes, totals, resampled, confidence=confidence)
+    share = float(successes.sum()) / float(totals.sum())
+    return widened(limits, share, effective_number(totals), confidence=confidence)
+
+
+def widened(
+    limits: tuple[float, float], share: float, n: float, *, confidence: float = 0.95
+) -> tuple[str, float, float]:
+    """Limits of a share over `n` clusters, nowhere narrower than the exact ones unless many succeed and many fail."""
+    k = min(n * share, n)
     if min(n - EXACT_BELOW, k - FEWEST_EACH, n - k - FEWEST_EACH) >= -_ROUNDING:
-        return "bootstrap", low, high
-    least, most = exact_limits(min(k, n), n, confidence=confidence)
-    return "bootstrap+exact", min(low, least), max(high, most)
+        return "bootstrap", *limits
+    least, most = exact_limits(k, n, confidence=confidence)
+    return "bootstrap+exact", min(limits[0], least), max(limits[1], most)
 
 
 def alike_limits(difference: float, n: float, *, confidence: float = 0.95) -> tuple[float, float]:
