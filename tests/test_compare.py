@@ -183,6 +183,42 @@ def test_the_median_is_resampled_too(tmp_path):
     assert (distance["difference"], distance["low"], distance["high"]) == (-2.0, -2.0, -1.0)
 
 
+def test_shares_that_differ_alike_in_five_objects_have_exact_limits(tmp_path):
+    """1 − 0.025^(1/5) = 0.521824; late never detects what the other does, then both detect the same."""
+    for late, expected in ((None, (-1.0, -0.478176)), (1.0, (-0.521824, 0.521824))):
+        rows = [r for k in range(5) for r in (row("ideal", 1.0, 30.0, object_id=str(k)),
+                                              row("late", late, late, object_id=str(k)))]  # fmt: skip
+        share = of(compared(tmp_path / str(late), rows), "detected_share")
+        assert (share["low"], share["high"]) == pytest.approx(expected, abs=1e-6)
+        assert (share["interval"], share["interval_over"]) == ("exact", "objects")
+
+
+def test_exact_limits_go_by_the_rows_of_each_object(tmp_path):
+    """One object in 20 runs, four in one each: n = 24² / (20² + 4) clusters."""
+    rows = [row(name, 1.0, 30.0, object_id="0", run=run) for run in range(20) for name in ("ideal", "late")]
+    rows += [row(name, 1.0, 30.0, object_id=str(k)) for k in range(1, 5) for name in ("ideal", "late")]
+    share = of(compared(tmp_path, rows), "detected_share")
+    limit = 1 - 0.025 ** (404 / 576)
+    assert (share["low"], share["high"]) == pytest.approx((-limit, limit))
+
+
+def test_means_that_are_all_alike_have_no_interval_and_one_that_is_not_brings_it_back(tmp_path):
+    rows = [r for k in range(9) for r in pairs_of([(1.5, 1.0), (2.5, 2.0)], object_id=str(k))]
+    time = of(compared(tmp_path / "alike", rows), "ttd_rmst_s")
+    assert time["difference"] == 0.5
+    assert time["interval"] == "all clusters alike"
+    assert time[["low", "high", "interval_over"]].isna().all()
+    time = of(compared(tmp_path / "other", [*rows, *pairs_of([(1.75, 1.0)], object_id="9")]), "ttd_rmst_s")
+    assert (time["interval"], time["interval_over"]) == ("bootstrap", "objects")
+    assert 0.5 <= time["low"] < time["high"] < 0.75
+
+
+def test_a_median_that_no_resample_moves_keeps_its_interval_where_clusters_differ(tmp_path):
+    rows = [r for k in range(20) for r in pairs_of([(1.0 + (k == 3), 1.0)], object_id=str(k))]
+    distance = of(compared(tmp_path, rows), "dad_median_m")
+    assert (distance["low"], distance["high"], distance["interval"]) == (0.0, 0.0, "bootstrap")
+
+
 def test_few_objects_have_no_interval_and_that_is_said(tmp_path):
     comparison = compared(tmp_path, [r for k in range(4) for r in pairs_of([(1.0, 0.0)] * 50, object_id=str(k))])
     assert comparison.table["low"].isna().all()

@@ -148,6 +148,16 @@ def test_what_the_table_shows_is_said_below(tmp_path):
     ]
 
 
+def test_who_is_better_beyond_the_interval_is_said(tmp_path):
+    rows = [row("ideal", 1.0, 30.0, object_id=str(k)) for k in range(6)]
+    rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
+    lines = comparison_text(compare([write_folder(tmp_path / "study", rows)])).splitlines()
+    assert lines[-2:] == [
+        "better than ideal in ttd_rmst_s, the interval excluding 0: fast",
+        "better than ideal in dad_median_m, the interval excluding 0: fast",
+    ]
+
+
 def test_without_an_interval_nothing_is_claimed(tmp_path):
     text = comparison_text(compare([write_folder(tmp_path / "a", [row("ideal", 1.0, 30.0), row("fast", 0.5, 35.0)])]))
     assert "-0.5" in text

@@ -593,8 +593,8 @@ class TestSweeps:
         assert 0.7 < times.get_ylim()[1] < 1
         said = note(figure).replace("\u00a0", " ")
         assert (
-            "n = 6 per point, seed 1. Latency: 10 fused lists per second. Bands of shares: 95 %, Wilson interval over runs"
-            in said
+            "n = 6 per point, seed 1. Latency: 10 fused lists per second. "
+            "Bands of shares: 95 %, Wilson interval over runs" in said
         )
         assert "reaches the top" in said
 
