@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.statistics import expanded_tail
 from copem_replay.tracks import Float, Int
 
 _CELLS = 4_000_000
@@ -42,23 +41,6 @@ def mcnemar(only_first: int, only_second: int) -> float:
     if only_first < 0 or only_second < 0:
         raise ValueError(f"mcnemar: expected counts of at least 0, found {only_first} and {only_second}")
     return min(1.0, 2.0 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
-
-
-def multiplicities(uniform: Float) -> NDArray[np.uint32]:
-    """(R, K) how often each cluster is drawn: of `uniform (R, K)`, between 0 and 1, u draws cluster ⌊u·K⌋.
-
-    Raises ValueError for other numbers, or no cluster.
-    """
-    if uniform.ndim != 2 or uniform.shape[1] == 0 or not ((uniform > 0) & (uniform < 1)).all():
-        raise ValueError("multiplicities: expected (R, K) numbers between 0 and 1, ends excluded, and a cluster")
-    R, K = uniform.shape
-    count = np.empty((R, K), dtype=np.uint32)
-    size = max(1, _CELLS // K)
-    for r in range(0, R, size):
-        block = uniform[r : r + size]
-        drawn = (block * K).astype(np.int64) + K * np.arange(len(block))[:, None]
-        count[r : r + size] = np.bincount(drawn.ravel(), minlength=block.size).reshape(block.shape)
-    return count
 
 
 def resampled_sums(sums: Float, count: NDArray[np.unsignedinteger[Any]]) -> Float:
@@ -112,34 +94,6 @@ def resampled_medians(values: Float, cluster: Int, count: NDArray[np.unsignedint
     reached = 2 * (before[:, None] + np.cumsum(weight, axis=1)) >= total[:, None]
     found = ranked[place[np.arange(R), np.argmax(reached, axis=1)]]
     return np.where(total > 0, found, np.nan)
-
-
-def percentile_limits(values: Float, *, clusters: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Quantiles of figures (R,) resampled over so many clusters, linear between neighbours: (low, high).
-
-    At the levels of a confidence, widened for few clusters (`statistics.expanded_tail`).
-
-    NaN among them had nothing to give and are left out; both limits are NaN where nothing is left. An infinite limit,
-    or NaN between −∞ and ∞, says that there is none.
-
-    Raises ValueError for `confidence` outside (0, 1), no cluster.
-
-    Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981) 139–158
-    (percentile method).
-    """
-    tail = expanded_tail(confidence, clusters)
-    ranked = np.sort(values[~np.isnan(values)])
-    if not len(ranked):
-        return math.nan, math.nan
-    low, high = (_between(ranked, level * (len(ranked) - 1)) for level in (tail, 1.0 - tail))
-    return low, high
-
-
-def _between(ranked: Float, place: float) -> float:
-    first = math.floor(place)
-    below, above = float(ranked[first]), float(ranked[min(first + 1, len(ranked) - 1)])
-    # Of two infinite neighbours the difference would be NaN.
-    return below if below == above or place == first else below + (above - below) * (place - first)
 
 
 def _check_clusters(count: NDArray[Any], clusters: int) -> None:

@@ -15,6 +15,7 @@ from copem_replay import replay as replays
 from copem_replay.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
 from copem_replay.exact import check_exact, exact_table
 from copem_replay.experiment import Experiment
+from copem_replay.fixed import fixed_in
 from copem_replay.memory import memory_notes
 from copem_replay.oddities import oddities
 from copem_replay.read import Recording
@@ -69,6 +70,7 @@ def run(
         horizon_s=horizon,
         exact=exact,
         accuracy=totals(parts),
+        fixed=fixed_in(experiment.as_written()),
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = notes_of(recordings, ready, experiment, replayed=True)
@@ -122,6 +124,7 @@ def _at_point(
         horizon_s=horizon,
         exact=_exactly(ready, experiment),
         accuracy=totals(parts),
+        fixed=fixed_in(experiment.as_written()),
     )
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)

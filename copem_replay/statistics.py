@@ -8,10 +8,9 @@ it is later.
 censor: F may stay below 1 for ever, and a quantile above its last value does not exist (None).
 *Restricted mean* at a horizon h: the mean of min(T, h), in which never counts as h.
 *Distance at detection*: far is good, so a row that was never detected ranks below every distance.
-*Interval*: two-sided, of a share; from independent rows (`wilson`), or from whole clusters of rows that hang
-together, such as logs or objects (`bootstrap_share`).
+*Interval*: two-sided, of a share of independent rows (`wilson`); of rows that hang together: intervals.py.
 
-Letters of the shapes: n rows, M distinct times of detection, K clusters. Every function raises ValueError
+Letters of the shapes: n rows, M distinct times of detection. Every function raises ValueError
 when shapes or values are not as said, or when there are no rows at all: that is a defect of the caller.
 """
 
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.tracks import Bool, Float, Int
+from copem_replay.tracks import Bool, Float
 
 CENSORED = 0
 """The ego left or the log ended: the object was still there to be detected."""
@@ -174,7 +173,7 @@ def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, 
     """
     if n < 1 or not 0 <= successes <= n:
         raise ValueError(f"wilson: expected 0 <= successes <= n and n >= 1, found {successes} of {n}")
-    z = -NormalDist().inv_cdf(_tail(confidence))
+    z = -NormalDist().inv_cdf(tail_of(confidence))
     share, z2 = successes / n, z * z
     centre = (share + z2 / (2 * n)) / (1 + z2 / n)
     half = z * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
@@ -182,67 +181,6 @@ def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, 
     low = 0.0 if successes == 0 else centre - half
     high = 1.0 if successes == n else centre + half
     return low, high
-
-
-def bootstrap_share(
-    successes: Int, totals: Int, *, uniform: Float, resamples: int = 2000, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Bound Σ successes / Σ totals by drawing whole clusters with replacement: (low, high), shares.
-
-    `successes (K,)` of `totals (K,)` in each cluster, 0 ≤ successes ≤ totals; a total may be 0.
-    `uniform (resamples, K)`: independent numbers in (0, 1), one per resample and place; u draws
-    cluster ⌊u·K⌋.
-    Resamples whose total is 0 have no share and are left out. The limits are quantiles of the resampled shares, at
-    levels widened for few clusters (`expanded_tail`), linear between neighbours: so the interval of the failures is
-    the mirror image, and no limit jumps to the next resample because a level is rounded.
-
-    Raises ValueError for no clusters, for other shapes or values than said, for `confidence` outside (0, 1),
-    and when no resample has a share.
-
-    Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981)
-    139–158 (percentile method).
-    """
-    K = _rows(successes, totals)
-    if (successes < 0).any() or (successes > totals).any():
-        raise ValueError("bootstrap_share: expected 0 <= successes <= totals in every cluster")
-    if uniform.shape != (resamples, K):
-        raise ValueError(f"bootstrap_share: expected uniform of {(resamples, K)}, found {uniform.shape}")
-    if not ((uniform > 0) & (uniform < 1)).all():
-        raise ValueError("bootstrap_share: expected uniform numbers between 0 and 1, ends excluded")
-    tail = expanded_tail(confidence, K)
-    sums = np.zeros((resamples, 2), dtype=np.int64)
-    # One resample at a time: the indices of all would need the memory of `uniform` once more, and so would
-    # what they fetch.
-    for r in range(resamples):
-        drawn = (uniform[r] * K).astype(np.int64)
-        sums[r] = successes[drawn].sum(), totals[drawn].sum()
-    sums = sums[sums[:, 1] > 0]
-    if len(sums) == 0:
-        raise ValueError("bootstrap_share: expected a total above 0, found none in any resample")
-    low, high = np.quantile(sums[:, 0] / sums[:, 1], (tail, 1.0 - tail), method="linear")
-    return float(low), float(high)
-
-
-def expanded_tail(confidence: float, clusters: int) -> float:
-    """The probability beyond each limit of a percentile interval over so many clusters; below (1 − confidence)/2.
-
-    A resample of K clusters varies less than K fresh ones would, by √((K − 1)/K), and its quantiles are normal ones
-    where Student's are due: with 5 clusters plain percentiles hold the truth 86 times of 100, not 95. The level is
-    Φ(−t·√(K/(K − 1))), t the two-sided quantile of Student's distribution with K − 1 degrees of freedom.
-
-    Raises ValueError for `confidence` outside (0, 1), `clusters` < 1; with one cluster nothing varies, the plain level.
-
-    Source: T. C. Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69 (2015) 371–386
-    (expanded percentile interval).
-    """
-    from scipy.special import ndtr, stdtrit
-
-    tail = _tail(confidence)
-    if clusters < 1:
-        raise ValueError(f"expected at least one cluster, found {clusters}")
-    if clusters == 1:
-        return tail
-    return float(ndtr(stdtrit(clusters - 1, tail) * math.sqrt(clusters / (clusters - 1))))
 
 
 def _check_columns(first: NDArray[Any], second: NDArray[Any]) -> None:
@@ -263,7 +201,7 @@ def _check_level(q: float) -> None:
         raise ValueError(f"expected a quantile level 0 < q <= 1, found {q}")
 
 
-def _tail(confidence: float) -> float:
+def tail_of(confidence: float) -> float:
     """Halve what a confidence leaves out: the probability beyond each limit."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"expected a confidence between 0 and 1, ends excluded, found {confidence}")

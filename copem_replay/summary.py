@@ -14,12 +14,12 @@ import pandas as pd
 from copem_replay.accuracy import Total
 from copem_replay.accuracy_figures import FIGURES
 from copem_replay.braking.driver import UNRESOLVED
-from copem_replay.chance import Address, Dice, object_words
+from copem_replay.fixed import NOTHING_DRAWN, Fixed
+from copem_replay.intervals import resamples, share_limits
 from copem_replay.statistics import (
     CENSORED,
     DETECTED,
     LEFT,
-    bootstrap_share,
     cumulative_incidence,
     quantile_time,
     quantile_with_never,
@@ -28,8 +28,6 @@ from copem_replay.statistics import (
 )
 from copem_replay.tracks import Bool, Float
 
-RESAMPLES = 2000
-"""Bootstrap resamples (chosen)."""
 FEWEST_CLUSTERS = 5
 """Fewer logs or objects than this are not resampled (the contract's)."""
 
@@ -50,12 +48,15 @@ def summary(
     horizon_s: float | None,
     exact: pd.DataFrame | None = None,
     accuracy: Mapping[str, Total] | None = None,
+    fixed: Fixed | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and what has to be said about them.
 
     `exact`: the rows of `exact.parquet`. `accuracy`: by configuration the sums its figures are made of.
+    `fixed`: what is the same in every run; None: nothing.
     """
     notes: list[str] = []
+    fixed = fixed or Fixed()
     judged = table[table["conflict"]] if "conflict" in table else table.iloc[:0]
     for what, rows_of, whom in (("detected", table, "measured objects"), ("pass", judged, "objects in conflict")):
         if len(rows_of) and clusters(rows_of)[0] is None:
@@ -69,11 +70,11 @@ def summary(
     for name in configurations:
         part = parts.get(name, table.iloc[:0])
         row: dict[str, object] = {"configuration": name, "n": len(part), "list_rate_hz": list_rate_hz[name]}
-        row |= _of_one(part, seed, horizon_s)
+        row |= _of_one(part, seed, horizon_s, fixed=fixed.known(name))
         if "conflict_detected" in table:
             row |= _foreseen(part, horizon_s)
         if "conflict" in table:
-            row |= _verdicts(part[part["conflict"]], seed)
+            row |= _verdicts(part[part["conflict"]], seed, fixed=fixed.passes(name))
         if accuracy:
             row |= {figure: of(accuracy[name]) for figure, of in FIGURES.items()}
         if exact is not None:
@@ -101,14 +102,14 @@ _TIMES = ("ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "ttd_rmst_horiz
 _EXACT = ("detected_share", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "ttd_rmst_s", "dad_median_m", "dad_p5_m")
 
 
-def _of_one(part: pd.DataFrame, seed: int, horizon_s: float | None) -> dict[str, object]:
+def _of_one(part: pd.DataFrame, seed: int, horizon_s: float | None, *, fixed: bool) -> dict[str, object]:
     detected = part["detected"].to_numpy(dtype=bool)
-    over, low, high = _interval(part, detected, seed)
+    kind, over, low, high = _interval(part, detected, seed, fixed=fixed)
     row: dict[str, object] = {
         "detected_share": detected.mean() if len(part) else None,
         "detected_share_low": low,
         "detected_share_high": high,
-        "interval": _kind(over) if len(part) else None,
+        "interval": kind,
         "interval_over": over,
     }
     return row | _times(part, detected, horizon_s)
@@ -157,16 +158,16 @@ def _foreseen(part: pd.DataFrame, horizon_s: float | None) -> dict[str, object]:
     }
 
 
-def _verdicts(part: pd.DataFrame, seed: int) -> dict[str, object]:
+def _verdicts(part: pd.DataFrame, seed: int, *, fixed: bool) -> dict[str, object]:
     """The share of the rows in conflict that pass."""
     passed = part["braking_pass"].to_numpy(dtype=bool)
-    over, low, high = _interval(part, passed, seed)
+    kind, over, low, high = _interval(part, passed, seed, fixed=fixed)
     return {
         "n_conflict": len(part),
         "pass_share": passed.mean() if len(part) else None,
         "pass_share_low": low,
         "pass_share_high": high,
-        "pass_interval": _kind(over) if len(part) else None,
+        "pass_interval": kind,
         "pass_interval_over": over,
     }
 
@@ -221,24 +222,24 @@ def _failed(judged: pd.DataFrame) -> float | None:
     return None if share < UNRESOLVED and np.isnan(fails).any() else share
 
 
-def _kind(over: str | None) -> str | None:
-    return {"runs": "wilson", None: None}.get(over, "bootstrap")
+def _interval(
+    part: pd.DataFrame, success: Bool, seed: int, *, fixed: bool
+) -> tuple[str | None, str | None, float | None, float | None]:
+    """Of which kind the limits of the share of successes are, what is resampled whole, and the limits.
 
-
-def _interval(part: pd.DataFrame, success: Bool, seed: int) -> tuple[str | None, float | None, float | None]:
-    """What is resampled whole, and the limits of the share of successes over it."""
+    `fixed`: the successes are the same in every run.
+    """
     over, cluster = clusters(part)
     if over is None or not len(part):
-        return None, None, None
+        return None, None, None, None
     if over == "runs":
-        return over, *wilson(int(success.sum()), len(success))
+        if fixed:
+            return NOTHING_DRAWN, None, None, None
+        return "wilson", over, *wilson(int(success.sum()), len(success))
     counted = pd.Series(success).groupby(cluster.to_numpy(), sort=True).agg(["sum", "count"])
-    names = [str(name) for name in counted.index]
     # Addressed by the clusters' names: every configuration resamples the same logs or objects.
-    zeros = np.zeros(len(names), dtype=np.int64)
-    address = Address(("",), zeros, object_words(names), zeros)
-    uniform = Dice(seed, "summary").uniform("bootstrap", address, np.arange(RESAMPLES))
-    limits = bootstrap_share(
-        counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), uniform=uniform
+    resampled = resamples([str(name) for name in counted.index], seed)
+    kind, low, high = share_limits(
+        counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), resampled
     )
-    return over, *limits
+    return kind, over, low, high

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pandas as pd
 
+from copem_replay.fixed import NOTHING_DRAWN
+from copem_replay.wording import interval_words
+
 
 def summary_text(summary: pd.DataFrame) -> str:
     """The summary for a terminal: what was known and when, then what braking would have made of it."""
@@ -19,7 +22,7 @@ def summary_text(summary: pd.DataFrame) -> str:
     ]
     shown = summary.assign(**{"95 %": _intervals(summary, "detected_share")})
     lines = [as_text(shown[[*columns, "dad_median_m", "dad_p5_m"]])]
-    lines += _over(summary, "interval")
+    lines += intervals_said(summary, "interval")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
         lines.append(f"ttd_rmst_s: mean time to detection, never detected counting as {cell(float(horizon.iloc[0]))} s")
@@ -31,7 +34,7 @@ def summary_text(summary: pd.DataFrame) -> str:
         verdicts = summary.assign(**{"95 %": _intervals(summary, "pass_share")})
         exact = ["pass_share_exact"] if "pass_share_exact" in summary else []
         lines += ["", as_text(verdicts[["configuration", "n_conflict", "pass_share", "95 %", *exact]])]
-        lines += _over(summary, "pass_interval")
+        lines += intervals_said(summary, "pass_interval")
         lines.append(
             "pass_share: of those in conflict, how many the declared driver, braking when it knew, stays clear of"
         )
@@ -43,9 +46,15 @@ def _intervals(summary: pd.DataFrame, of: str) -> list[str]:
     return [f"[{cell(low)}, {cell(high)}]" if pd.notna(low) else "–" for low, high in limits]
 
 
-def _over(summary: pd.DataFrame, name: str) -> list[str]:
-    over = summary[f"{name}_over"].dropna()
-    return [f"95 %: {summary[name].dropna().iloc[0]} interval over {over.iloc[0]}"] if len(over) else []
+def intervals_said(summary: pd.DataFrame, name: str) -> list[str]:
+    """Of which kind the limits are that the column `name` tells of, and which rows have none as nothing is drawn."""
+    there = summary.dropna(subset=f"{name}_over").drop_duplicates([name, f"{name}_over"])
+    kinds = [interval_words(*of) for of in there[[name, f"{name}_over"]].itertuples(index=False)]
+    lines = [f"95 %: {'; '.join(kinds)}"] if kinds else []
+    same = summary.loc[summary[name] == NOTHING_DRAWN, "configuration"]
+    if len(same):
+        lines.append(f"no 95 % of {', '.join(same)}: nothing drawn, every run is the same")
+    return lines
 
 
 def as_text(table: pd.DataFrame) -> str:

@@ -1,4 +1,4 @@
-"""How counts read in notes and messages."""
+"""How counts and kinds of intervals read in notes, messages and tables."""
 
 from __future__ import annotations
 
@@ -11,3 +11,13 @@ def printable(text: str) -> str:
 def counted(number: int, noun: str, plural: str = "") -> str:
     """`1 message`, `2 messages`; `plural` where it is not the noun with an s."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def interval_words(kind: str, over: str) -> str:
+    """What limits are, by their kind and what they are over in `summary.csv`; unknown kinds as they are."""
+    words = {
+        "wilson": "Wilson interval over {}",
+        "bootstrap": "bootstrap interval over {}",
+        "bootstrap+exact": "bootstrap interval over {}, nowhere narrower than exact binomial limits",
+    }
+    return words.get(kind, f"{kind} interval over {{}}").format(over)

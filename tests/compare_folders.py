@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
 from scipy import stats
+
+from copem_replay.chance import Address, Dice, object_words
 
 Row = dict[str, Any]
 
@@ -18,6 +23,22 @@ def widened(clusters: int, confidence: float = 0.95) -> list[float]:
     """Levels of both limits: Student's quantile for a normal one, a resample's spread √((K − 1)/K) of a fresh one's."""
     t = stats.t.ppf((1 + confidence) / 2, clusters - 1) * (clusters / (clusters - 1)) ** 0.5
     return [float(stats.norm.sf(t)), float(stats.norm.cdf(t))]
+
+
+def limits_of(names: Sequence[str], figure: Callable[[list[str]], float], seed: int = 1) -> tuple[float, float]:
+    """Limits of a figure of the drawn clusters: of all K^K resamples below eight clusters, else of 2000 by the dice."""
+    ranked, K = sorted(names), len(names)
+    if K < 8:
+        drawn = Counter(tuple(sorted(some)) for some in itertools.product(ranked, repeat=K))
+    else:
+        zeros = np.zeros(K, dtype=np.int64)
+        uniform = Dice(seed, "summary").uniform(
+            "bootstrap", Address(("",), zeros, object_words(ranked), zeros), np.arange(2000)
+        )
+        drawn = Counter(tuple(ranked[int(u * K)] for u in resample) for resample in uniform)
+    figures = [figure(list(some)) for some in drawn]
+    low, high = np.quantile(np.repeat(figures, list(drawn.values())), widened(K))
+    return float(low), float(high)
 
 
 INSTANTS = [0.0, 1.0, 2.0, 3.0]

@@ -11,8 +11,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from compare_folders import BRAKING, Row, row, widened, write_folder
-from copem_replay.chance import Address, Dice, object_words
+from compare_folders import BRAKING, Row, limits_of, row, write_folder
 from copem_replay.compare import Comparison, compare
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 
@@ -133,18 +132,13 @@ SEED = 5
 
 
 def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]], seed: int = SEED) -> tuple[float, float]:
-    """2000 times: as many clusters as there are, drawn by the dice; the mean of all differences in them."""
-    names = sorted(clusters)
-    zeros = np.zeros(len(names), dtype=np.int64)
-    uniform = Dice(seed, "summary").uniform(
-        "bootstrap", Address(("",), zeros, object_words(names), zeros), np.arange(2000)
-    )
-    means = []
-    for resample in uniform:
-        pairs = [pair for u in resample for pair in clusters[names[int(u * len(names))]]]
-        means.append(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
-    low, high = np.quantile(means, widened(len(names)))
-    return float(low), float(high)
+    """Of resamples with as many clusters as there are, the mean of all differences in them."""
+
+    def mean(drawn: list[str]) -> float:
+        pairs = [pair for name in drawn for pair in clusters[name]]
+        return float(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
+
+    return limits_of(list(clusters), mean, seed)
 
 
 def pairs_of(times: Sequence[tuple[float, float]], **where: Any) -> list[Row]:
@@ -187,6 +181,42 @@ def test_the_median_is_resampled_too(tmp_path):
     rows = [r for k in range(6) for r in pairs_of([(1.0 + k % 2, 0.0)], object_id=str(k))]
     distance = of(compared(tmp_path, rows), "dad_median_m")
     assert (distance["difference"], distance["low"], distance["high"]) == (-2.0, -2.0, -1.0)
+
+
+def test_shares_that_differ_alike_in_five_objects_have_exact_limits(tmp_path):
+    """1 − 0.025^(1/5) = 0.521824; late never detects what the other does, then both detect the same."""
+    for late, expected in ((None, (-1.0, -0.478176)), (1.0, (-0.521824, 0.521824))):
+        rows = [r for k in range(5) for r in (row("ideal", 1.0, 30.0, object_id=str(k)),
+                                              row("late", late, late, object_id=str(k)))]  # fmt: skip
+        share = of(compared(tmp_path / str(late), rows), "detected_share")
+        assert (share["low"], share["high"]) == pytest.approx(expected, abs=1e-6)
+        assert (share["interval"], share["interval_over"]) == ("exact", "objects")
+
+
+def test_exact_limits_go_by_the_rows_of_each_object(tmp_path):
+    """One object in 20 runs, four in one each: n = 24² / (20² + 4) clusters."""
+    rows = [row(name, 1.0, 30.0, object_id="0", run=run) for run in range(20) for name in ("ideal", "late")]
+    rows += [row(name, 1.0, 30.0, object_id=str(k)) for k in range(1, 5) for name in ("ideal", "late")]
+    share = of(compared(tmp_path, rows), "detected_share")
+    limit = 1 - 0.025 ** (404 / 576)
+    assert (share["low"], share["high"]) == pytest.approx((-limit, limit))
+
+
+def test_means_that_are_all_alike_have_no_interval_and_one_that_is_not_brings_it_back(tmp_path):
+    rows = [r for k in range(9) for r in pairs_of([(1.5, 1.0), (2.5, 2.0)], object_id=str(k))]
+    time = of(compared(tmp_path / "alike", rows), "ttd_rmst_s")
+    assert time["difference"] == 0.5
+    assert time["interval"] == "all clusters alike"
+    assert time[["low", "high", "interval_over"]].isna().all()
+    time = of(compared(tmp_path / "other", [*rows, *pairs_of([(1.75, 1.0)], object_id="9")]), "ttd_rmst_s")
+    assert (time["interval"], time["interval_over"]) == ("bootstrap", "objects")
+    assert 0.5 <= time["low"] < time["high"] < 0.75
+
+
+def test_a_median_that_no_resample_moves_keeps_its_interval_where_clusters_differ(tmp_path):
+    rows = [r for k in range(20) for r in pairs_of([(1.0 + (k == 3), 1.0)], object_id=str(k))]
+    distance = of(compared(tmp_path, rows), "dad_median_m")
+    assert (distance["low"], distance["high"], distance["interval"]) == (0.0, 0.0, "bootstrap")
 
 
 def test_few_objects_have_no_interval_and_that_is_said(tmp_path):
@@ -238,9 +268,15 @@ def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
     folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
     table = compare(folders, baseline="first:x").table
     assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
-    assert (table[["difference", "low", "high"]].fillna(0.0) == 0.0).all(axis=None)
-    assert table["difference"].notna().all()
-    assert table.loc[table["log"] == "all", "low"].notna().all()
+    assert (table["difference"] == 0.0).all()
+    table = table[table["log"] == "all"].set_index("metric")
+    # None of eight clusters differs, and of the six in conflict none: 1 − 0.025^(1/8), 1 − 0.025^(1/6).
+    for metric, limit in (("detected_share", 0.369417), ("pass_share", 0.459258)):
+        assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
+        assert table.loc[metric, "interval"] == "exact"
+    others = table.loc[["ttd_rmst_s", "dad_median_m"]]
+    assert (others["interval"] == "all clusters alike").all()
+    assert others[["low", "high", "interval_over"]].isna().all(axis=None)
 
 
 def test_the_order_of_rows_does_not_matter(tmp_path):
@@ -288,12 +324,8 @@ def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tm
     keys = sorted(sides["ideal"])
     assert time["value"] == pytest.approx(mean("late", keys))
     assert time["baseline_value"] == pytest.approx(mean("ideal", keys))
-    zeros = np.zeros(len(keys), dtype=np.int64)
-    address = Address(("",), zeros, object_words(keys), zeros)
-    uniform = Dice(SEED, "summary").uniform("bootstrap", address, np.arange(2000))
-    drawn = [[keys[int(u * len(keys))] for u in resample] for resample in uniform]
-    figures = [mean("late", some) - mean("ideal", some) for some in drawn]
-    assert (time["low"], time["high"]) == pytest.approx(tuple(np.quantile(figures, widened(6))), abs=1e-9)
+    expected = limits_of(keys, lambda drawn: mean("late", drawn) - mean("ideal", drawn), SEED)
+    assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-9)
 
 
 def test_all_metrics_of_a_pair_are_resampled_alike_or_not_at_all(tmp_path):

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from compare_folders import widened
-from copem_replay.paired import mcnemar, multiplicities, percentile_limits, resampled_medians, resampled_sums
+from copem_replay.intervals import Resamples, multiplicities, percentile_limits
+from copem_replay.paired import mcnemar, resampled_medians, resampled_sums
 from copem_replay.statistics import quantile_with_never
 
 counts = st.integers(0, 400)
@@ -103,25 +104,31 @@ def test_medians_are_those_of_statistics_with_weights():
     assert resampled_medians(values, cluster, count).tolist() == expected
 
 
+def limits(values, clusters, confidence=0.95):
+    """Of figures of so many resamples, each drawn once."""
+    drawn = Resamples(np.ones((len(values), clusters), dtype=np.uint32), np.ones(len(values), dtype=np.int64))
+    return percentile_limits(np.array(values), drawn, confidence=confidence)
+
+
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.integers(2, 200), st.floats(0.5, 0.99))
 def test_limits_are_quantiles_linear_between_neighbours(values, clusters, confidence):
     expected = np.quantile(values, widened(clusters, confidence))
-    found = percentile_limits(np.array(values), clusters=clusters, confidence=confidence)
+    found = limits(values, clusters, confidence)
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
 
 
 def test_what_resamples_do_not_have_is_left_out_of_the_limits():
-    assert percentile_limits(np.array([math.nan, 2.0, math.nan]), clusters=5) == (2.0, 2.0)
-    assert all(math.isnan(limit) for limit in percentile_limits(np.array([math.nan]), clusters=5))
+    assert limits([math.nan, 2.0, math.nan], 5) == (2.0, 2.0)
+    assert all(math.isnan(limit) for limit in limits([math.nan], 5))
 
 
 def test_limits_among_infinite_figures_are_infinite():
-    low, high = percentile_limits(np.array([-math.inf] * 10 + [1.0] * 90), clusters=50)
+    low, high = limits([-math.inf] * 10 + [1.0] * 90, 50)
     assert (low, high) == (-math.inf, 1.0)
     # Between one and the other infinity there is no number.
-    assert math.isnan(percentile_limits(np.array([-math.inf, math.inf]), clusters=50, confidence=0.5)[0])
+    assert math.isnan(limits([-math.inf, math.inf], 50, 0.5)[0])
 
 
 def test_a_confidence_of_one_is_refused():
     with pytest.raises(ValueError, match="confidence"):
-        percentile_limits(np.ones(3), clusters=5, confidence=1.0)
+        limits([1.0] * 3, 5, 1.0)

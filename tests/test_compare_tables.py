@@ -129,9 +129,11 @@ def test_the_table_has_signs_and_intervals(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()
     assert lines[0].split() == ["configuration", "detected_share", "ttd_rmst_s", "dad_median_m"]
     by_name = {line.split()[0]: line for line in lines[1:4]}
-    assert "±0 [0, 0]" in by_name["same"]
-    assert "-0.25 [-0.25, -0.25]" in by_name["fast"]
-    assert "+2.5 [2.5, 2.5]" in by_name["fast"]
+    # Of six: 1 − 0.025^(1/6).
+    assert by_name["same"].split(maxsplit=1)[1].split("  ")[0] == "±0 [-0.459, 0.459]"
+    assert by_name["same"].count("±0 (all alike)") == 2
+    assert "-0.25 (all alike)" in by_name["fast"]
+    assert "+2.5 (all alike)" in by_name["fast"]
     assert "-0.5 [-1, 0]" in by_name["a|worse"]  # six are few: anything
     assert "+4.5 [" in by_name["a|worse"]
     assert by_name["a|worse"].endswith("–")  # half of them never: no median
@@ -143,8 +145,19 @@ def test_what_the_table_shows_is_said_below(tmp_path):
     assert lines == [
         "differences to ideal, paired by log, object and run; accuracy at instants that both have",
         "[95 %]: bootstrap interval over objects",
+        "detected_share: exact binomial limits where the difference is the same in every cluster, for resamples then "
+        "are all the same, too",
+        "(all alike): the difference is the same in every cluster, so that nothing tells how it varies",
         "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that, who was still there at the "
         "end as censored",
+    ]
+
+
+def test_who_is_better_beyond_the_interval_is_said(tmp_path):
+    rows = [row("ideal", 1.0, 30.0, object_id=str(k)) for k in range(6)]
+    rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
+    lines = comparison_text(compare([write_folder(tmp_path / "study", rows)])).splitlines()
+    assert lines[-2:] == [
         "better than ideal in ttd_rmst_s, the interval excluding 0: fast",
         "better than ideal in dad_median_m, the interval excluding 0: fast",
     ]
@@ -219,7 +232,8 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
         read = list(csv.DictReader(file))
     assert list(read[0]) == [
         "log", "configuration", "baseline", "metric", "value", "baseline_value", "difference", "low", "high",
-        "interval_over", "n", "p_value", "only_configuration", "only_baseline", "existence", "baseline_existence",
+        "interval", "interval_over", "n", "p_value", "only_configuration", "only_baseline", "existence",
+        "baseline_existence",
         "ghosts_kept_per_min", "baseline_ghosts_kept_per_min",
     ]  # fmt: skip
     assert [(r["log"], r["configuration"], r["metric"]) for r in read[3:6]] == [
@@ -230,6 +244,7 @@ def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
     assert (fast["p_value"], fast["only_baseline"], fast["existence"]) == ("", "", "")
     assert (share["only_configuration"], share["only_baseline"], share["p_value"]) == ("0", "3", "0.25")
     assert (read[8]["difference"], read[8]["low"], read[8]["interval_over"]) == ("", "", "")
+    assert (fast["low"], fast["interval"], share["interval"]) == ("", "all clusters alike", "bootstrap")
 
 
 def test_the_files_name_says_what_is_written(tmp_path):

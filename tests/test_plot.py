@@ -28,6 +28,7 @@ from copem_replay import cli
 from copem_replay.check import problems, read_logs
 from copem_replay.errors import InputError
 from copem_replay.experiment_file import load, log_paths
+from copem_replay.intervals import resamples, share_limits
 from copem_replay.plot import (
     Results,
     curves_figure,
@@ -38,7 +39,7 @@ from copem_replay.plot import (
     write_figures,
 )
 from copem_replay.plot.appearance import appearances
-from copem_replay.plot.bands import band, multiplicities, resampled_incidence
+from copem_replay.plot.bands import band, resampled_incidence
 from copem_replay.plot.captions import percent, short_names
 from copem_replay.plot.choice import choose
 from copem_replay.plot.distances import FAIL, NEUTRAL, PASS, spread
@@ -484,7 +485,7 @@ class TestCurves:
         low, high = at_first[at_first > 0].min(), at_first.max()
         half = 1.96 * (share[0] * (1 - share[0]) / 40) ** 0.5
         assert (low, high) == (pytest.approx(share[0] - half, abs=0.05), pytest.approx(share[0] + half, abs=0.05))
-        assert "bootstrap over whole runs (400 resamples)" in note(figure)
+        assert "Bands: 95 %, bootstrap over whole runs, or exact binomial limits where few decide" in note(figure)
 
     def test_exact(self, mine: Path) -> None:
         # Of two objects one is known at once or after a second, the other half the time after a second, else never.
@@ -515,24 +516,27 @@ class TestBands:
             k = np.searchsorted(times_s, at_s, side="right")
             assert found[r] == pytest.approx(np.append(0.0, share)[k])
 
-    def test_draws(self) -> None:
-        names = [f"log {k}" for k in range(6)]
-        counts = multiplicities(names, 3)
-        assert counts.shape == (400, 6)
-        assert (counts.sum(axis=1) == 6).all()
-        assert counts.mean() == 1
-        assert (multiplicities(names, 3) == counts).all()
-        assert (multiplicities(names, 4) != counts).any()
-
     def test_clusters_stay_whole(self) -> None:
         # Each of five objects is always or never known: a share is then a number of fifths.
         time_s = np.repeat([1.0, 1.0, 1.0, 5.0, 5.0], 20)
         ending = np.repeat([DETECTED, DETECTED, DETECTED, LEFT, LEFT], 20)
         names = np.repeat(list("abcde"), 20)
         low, high = band(time_s, ending, list(names), np.array([0.5, 1.0]), 1)
-        assert (low[0], high[0]) == (0, 0)
-        assert low[1] == pytest.approx(0.2)
-        assert high[1] == pytest.approx(1.0)
+        # None known by then: none of five, 1 − 0.025^(1/5). Then three of five: all or none is drawn often enough.
+        assert (low[0], high[0]) == (0, pytest.approx(0.521824, abs=1e-6))
+        assert (low[1], high[1]) == (0.0, 1.0)
+
+    def test_bands_end_where_the_summary_does(self) -> None:
+        """Twelve objects of 20 runs: at last the share detected and its limits, but for fewer resamples."""
+        generator = np.random.default_rng(4)
+        totals, known = np.full(12, 20), generator.binomial(20, generator.beta(4, 1, 12))
+        names = [f"object {k}" for k in range(12)]
+        rows = [(name, DETECTED if k < n else LEFT) for name, n in zip(names, known, strict=True) for k in range(20)]
+        cluster, ending = [name for name, _ in rows], np.array([how for _, how in rows])
+        low, high = band(np.ones(240), ending, cluster, np.array([1.0]), 1)
+        kind, least, most = share_limits(known, totals, resamples(sorted(names), 1))
+        assert kind == "bootstrap+exact"
+        assert (low[0], high[0]) == pytest.approx((least, most), abs=0.02)
 
     def test_which_clusters(self) -> None:
         def rows(logs: int, things: int, runs: int = 2) -> pd.DataFrame:
@@ -589,8 +593,8 @@ class TestSweeps:
         assert 0.7 < times.get_ylim()[1] < 1
         said = note(figure).replace("\u00a0", " ")
         assert (
-            "n = 6 per point, seed 1. Latency: 10 fused lists per second. Bands of shares: 95 %, Wilson over runs"
-            in said
+            "n = 6 per point, seed 1. Latency: 10 fused lists per second. "
+            "Bands of shares: 95 %, Wilson interval over runs" in said
         )
         assert "reaches the top" in said
 

@@ -307,6 +307,17 @@ class TestInARun:
         assert row(result, "union")["distance_at_detection_m"] == pytest.approx(40.0)
         assert figure(result, "position_rmse_m") == pytest.approx(np.sqrt(0.5)), "0 m and 1 m off; car 1 is missed"
 
+    def test_two_thousand_copies_of_one_row_have_no_interval(self, tmp_path: Path) -> None:
+        path = drive(tmp_path / "a.mcap", *(list_of(k / 10, car(30)) for k in range(21)))
+        summary = replayed(path, runs=2000).summary.set_index("configuration")
+        assert (summary["n"] == 2000).all()
+        assert (summary["interval"] == "nothing drawn").all()
+        assert summary[["detected_share_low", "detected_share_high", "interval_over"]].isna().all(axis=None)
+        more: Any = {"pems": {"p": [{"detection": {"kind": "constant", "probability": 1.0}}]}}
+        more["units"] = plan_of(path).as_written()["units"] | {"ego": {"on": "ego", "pem": "p"}}
+        more["configurations"] = {"both": {"units": ["ego", "rsu"]}}
+        assert replayed(path, **more).summary["interval"].tolist() == ["wilson"]
+
     def test_its_results_run_again(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = drive(tmp_path / "a.mcap", *(list_of(k / 10, car(30 + k % 3)) for k in range(21)))
         (tmp_path / "e.yaml").write_text(dump(plan_of(path, show={"run": 0}).as_written()))

@@ -1,6 +1,5 @@
 """Curves, quantiles and intervals against numbers computed by hand, their definitions, and symmetries."""
 
-import itertools
 import math
 from collections.abc import Callable
 from fractions import Fraction
@@ -12,14 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compare_folders import widened
 from copem_replay.statistics import (
     CENSORED,
     DETECTED,
     LEFT,
-    bootstrap_share,
     cumulative_incidence,
-    expanded_tail,
     quantile_time,
     quantile_with_never,
     restricted_mean,
@@ -387,139 +383,9 @@ def test_failures_have_the_mirrored_interval(n: int, data: st.DataObject):
     assert wilson(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-14)
 
 
-# ------------------------------------------------------------------------------------ bootstrap
-
-
-def share(successes: list[int], totals: list[int], uniform: Array, confidence: float) -> tuple[float, float]:
-    return bootstrap_share(
-        np.array(successes),
-        np.array(totals),
-        uniform=uniform,
-        resamples=len(uniform),
-        confidence=confidence,
-    )
-
-
-def every_resample(clusters: int) -> Array:
-    """Numbers that draw each of the K^K resamples once."""
-    return (np.array(list(itertools.product(range(clusters), repeat=clusters))) + 0.5) / clusters
-
-
-def test_four_resamples_by_hand():
-    # Clusters 0 of 2 and 4 of 4. Drawn: both first, first and second twice, both second.
-    uniform = np.array([[0.1, 0.2], [0.1, 0.9], [0.6, 0.4], [0.99, 0.5]])
-    # Shares 0, 2/3, 2/3, 1. Two clusters: Student's quantile of one degree of freedom is 1, by √2: Φ(−√2) = 0.0786496.
-    steps = 3 * 0.07864960352514258
-    expected = (2 / 3 * steps, 1 - 1 / 3 * steps)
-    assert share([0, 4], [2, 4], uniform, 0.5) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize(("clusters", "tail"), [(1, 0.025), (2, 0.0), (5, 0.00095), (10, 0.00855), (10**6, 0.025)])
-def test_few_clusters_widen_the_tails(clusters, tail):
-    assert expanded_tail(0.95, clusters) == pytest.approx(tail, abs=5e-6)
-
-
-def test_no_cluster_has_no_tail():
-    with pytest.raises(ValueError, match="cluster"):
-        expanded_tail(0.95, 0)
-
-
-@pytest.mark.long
-def test_intervals_over_few_clusters_hold_the_mean_as_often_as_they_say():
-    """Means of 5 clusters of equal size: plain percentiles hold it 85 times of 100; these at least 91."""
-    dice = np.random.default_rng(11)
-    held = 0
-    for _ in range(400):
-        shares = dice.beta(4, 4, 5)
-        successes, totals = np.rint(shares * 10_000).astype(int), np.full(5, 10_000)
-        low, high = bootstrap_share(successes, totals, uniform=dice.uniform(1e-9, 1, (1000, 5)), resamples=1000)
-        held += low <= 0.5 <= high
-    assert held >= 0.91 * 400
-
-
-def test_resamples_without_any_total_are_left_out():
-    # Of the four, the one that draws the empty cluster twice says nothing; all others say 1/3.
-    uniform = np.array([[0.1, 0.2], [0.1, 0.9], [0.6, 0.4], [0.99, 0.5]])
-    assert share([0, 1], [0, 3], uniform, 0.95) == pytest.approx((1 / 3, 1 / 3), abs=1e-15)
-
-
-def test_numbers_next_to_the_ends_draw_the_first_and_the_last_cluster():
-    least, most = np.nextafter(0.0, 1.0), np.nextafter(1.0, 0.0)
-    for clusters in (1, 3, 7, 10, 1000):
-        successes = [0] * (clusters - 1) + [1]
-        assert share(successes, [1] * clusters, np.full((2, clusters), most), 0.9) == (1.0, 1.0)
-        if clusters > 1:
-            assert share(successes, [1] * clusters, np.full((2, clusters), least), 0.9) == (0.0, 0.0)
-
-
-tallies = st.lists(
-    st.integers(0, 5).flatmap(lambda total: st.tuples(st.integers(0, total), st.just(total))),
-    min_size=1,
-    max_size=4,
-).filter(lambda clusters: any(total for _, total in clusters))
-
-
-def sorted_shares(clusters: list[tuple[int, int]]) -> list[Fraction]:
-    """Shares of all equally likely resamples that have one, in fractions."""
-    shares = []
-    for drawn in itertools.product(clusters, repeat=len(clusters)):
-        if total := sum(t for _, t in drawn):
-            shares.append(Fraction(sum(s for s, _ in drawn), total))
-    return sorted(shares)
-
-
-@given(tallies, st.integers(1, 19))
-def test_over_every_resample_the_limits_are_its_ordered_shares(clusters: list[tuple[int, int]], tail: int):
-    shares = sorted_shares(clusters)
-    successes, totals = (list(column) for column in zip(*clusters, strict=True))
-    # `tail` fortieths on each side, widened; between two ordered shares, straight.
-    low, high = widened(len(clusters), 1 - tail / 20) if len(clusters) > 1 else (tail / 40, 1 - tail / 40)
-    expected = []
-    for level in (Fraction(low), Fraction(high)):
-        steps = level * (len(shares) - 1)
-        below = math.floor(steps)
-        above = min(below + 1, len(shares) - 1)
-        expected.append(float(shares[below] + (steps - below) * (shares[above] - shares[below])))
-    found = share(successes, totals, every_resample(len(clusters)), 1 - tail / 20)
-    assert found == pytest.approx(expected, abs=1e-12)
-
-
-@given(tallies, st.integers(2, 50))
-def test_more_rows_of_the_same_kind_in_each_cluster_teach_nothing(clusters: list[tuple[int, int]], copies: int):
-    successes, totals = (list(column) for column in zip(*clusters, strict=True))
-    uniform = every_resample(len(clusters))
-    once = share(successes, totals, uniform, 0.9)
-    often = share([s * copies for s in successes], [t * copies for t in totals], uniform, 0.9)
-    assert often == pytest.approx(once, abs=1e-14)
-
-
-@given(tallies, st.integers(0, 2**32 - 1))
-def test_failures_have_the_mirrored_bootstrap_interval(clusters: list[tuple[int, int]], seed: int):
-    successes, totals = (list(column) for column in zip(*clusters, strict=True))
-    # The first rows draw each cluster alone, so that there is always a resample with a total.
-    alone = np.repeat(np.arange(len(clusters))[:, None] + 0.5, len(clusters), axis=1) / len(clusters)
-    uniform = np.concatenate([alone, np.random.default_rng(seed).uniform(1e-9, 1.0, (30, len(clusters)))])
-    low, high = share(successes, totals, uniform, 0.8)
-    failures = [t - s for s, t in clusters]
-    assert share(failures, totals, uniform, 0.8) == pytest.approx((1 - high, 1 - low), abs=1e-12)
-
-
-def test_over_independent_rows_it_agrees_with_theory_at_the_default_size():
-    # 400 rows of one, half of them successes: 1.96 · √(0.25/400) = 0.049 to either side.
-    uniform = np.random.default_rng(7).uniform(1e-9, 1.0, (2000, 400))
-    successes = np.tile([0, 1], 200)
-    low, high = bootstrap_share(successes, np.ones(400, dtype=np.int64), uniform=uniform)
-    assert low == pytest.approx(0.451, abs=0.006)
-    assert high == pytest.approx(0.549, abs=0.006)
-    # The same rows in 20 clusters of one mind each: √20 times as wide.
-    low, high = bootstrap_share(np.tile([0, 20], 10), np.full(20, 20), uniform=uniform[:, :20])
-    assert high - low == pytest.approx(2 * 0.049 * math.sqrt(20), abs=0.05)
-
-
 # --------------------------------------------------------------------------- what is not accepted
 
 ONE = np.array([1.0])
-HALF = np.full((2, 1), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -546,17 +412,6 @@ HALF = np.full((2, 1), 0.5)
         (lambda: wilson(6, 5), "found 6 of 5"),
         (lambda: wilson(1, 5, confidence=1.0), "confidence"),
         (lambda: wilson(1, 5, confidence=0.0), "confidence"),
-        (lambda: share([], [], np.empty((2, 0)), 0.9), "at least one row"),
-        (lambda: share([2], [1], HALF, 0.9), "successes <= totals"),
-        (lambda: share([-1], [1], HALF, 0.9), "successes <= totals"),
-        (lambda: share([1], [1, 1], HALF, 0.9), "equal length"),
-        (lambda: share([1, 1], [1, 1], HALF, 0.9), "expected uniform of"),
-        (lambda: bootstrap_share(np.array([1]), np.array([1]), uniform=HALF), "expected uniform of"),
-        (lambda: share([1], [1], HALF * 2, 0.9), "ends excluded"),
-        (lambda: share([1], [1], HALF * 0, 0.9), "ends excluded"),
-        (lambda: share([1], [1], HALF * np.nan, 0.9), "ends excluded"),
-        (lambda: share([1], [1], HALF, 1.0), "confidence"),
-        (lambda: share([0], [0], HALF, 0.9), "total above 0"),
     ],
 )
 def test_a_defect_of_the_caller_is_said(call: Callable[[], object], reason: str):

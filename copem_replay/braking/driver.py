@@ -168,7 +168,7 @@ def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
     Raises InputError when it is no probability, or not of the delays that the same reaction gives.
     """
     where = "braking.driver.reaction"
-    what = f"{where}: {reaction.kind}: survival(delay_s)"
+    what = "survival(delay_s)"
 
     def survival(of_s: Float) -> Float | None:
         given = asked(reaction, where, lambda: reaction.survival(of_s))
@@ -176,10 +176,10 @@ def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
             return None
         found = asked(reaction, where, lambda: np.asarray(given, dtype=float))
         if found.shape != of_s.shape:
-            raise InputError(f"{what}: expected shape {of_s.shape}, found {found.shape}")
-        wrong = ~((found >= 0) & (found <= 1))
-        if wrong.any():
-            raise InputError(f"{what}: expected probabilities 0 … 1, found {found[wrong][0]}")
+            raise wrong(reaction, where, f"{what}: expected shape {of_s.shape}, found {found.shape}", "survival")
+        none = ~((found >= 0) & (found <= 1))
+        if none.any():
+            raise wrong(reaction, where, f"{what}: expected probabilities 0 … 1, found {found[none][0]}", "survival")
         return found
 
     found = survival(delay_s)
@@ -193,10 +193,11 @@ def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
         off = np.flatnonzero((sign * (there - (1 - _TRIED)) > 1e-6) & (at_s > 0))
         if len(off):
             k = off[0]
-            raise InputError(
+            raise wrong(
+                reaction, where,
                 f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
-                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {there[k]:g}"
-            )
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {there[k]:g}", "survival",
+            )  # fmt: skip
     return found
 
 

@@ -13,7 +13,8 @@ import pandas as pd
 from copem_replay.compare.comparable import check_comparable
 from copem_replay.compare.folders import Folder, read_folders
 from copem_replay.compare.grid import Grid, grid_of
-from copem_replay.compare.intervals import Draws, Whose, clusters, resampled_over
+from copem_replay.compare.intervals import Draws, Whose
+from copem_replay.compare.limits import limits
 from copem_replay.compare.names import Named, chosen, named
 from copem_replay.compare.notes import (
     note_on_measuring,
@@ -25,7 +26,7 @@ from copem_replay.compare.notes import (
 from copem_replay.compare.regret import Regret, Setting, own_rate, regrets
 from copem_replay.compare.sides import Side, side_of
 from copem_replay.errors import InputError
-from copem_replay.paired import mcnemar, percentile_limits
+from copem_replay.paired import mcnemar
 from copem_replay.tracks import SAME_INSTANT_NS
 
 ALL = "all"
@@ -42,6 +43,7 @@ COLUMNS = {
     "difference": "float64",
     "low": "float64",
     "high": "float64",
+    "interval": "object",
     "interval_over": "object",
     "n": "int64",
     "p_value": "float64",
@@ -108,7 +110,8 @@ def compare(
         pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
         for regret in regrets(first, second, grid, setting):
             names = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
-            rows += (row | names for row in _rows(regret, pair, grid, draws))
+            fixed = _fixed(regret.metric, one, against)
+            rows += (row | names for row in _rows(regret, pair, grid, draws, fixed=fixed))
     # All logs first, then log by log; configurations and metrics stay in their order.
     rows = [row for log in (ALL_LOGS, *range(len(grid.logs))) for row in rows if row["log_ix"] == log]
     table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
@@ -156,23 +159,30 @@ def _check_same_looks(one: Named, first: Side, against: Named, second: Side, gri
             )
 
 
-def _rows(regret: Regret, pair: Whose, grid: Grid, draws: Draws) -> Iterator[dict[str, object]]:
-    """A row of all logs, then, where there are several, one for each. `pair`: all rows that both sides have."""
-    yield _row(regret, pair, grid, draws) | {"log": ALL, "log_ix": ALL_LOGS}
+def _fixed(metric: str, *sides: Named) -> bool:
+    """Whether a metric is the same in every run, with all of them."""
+    if metric == "pass_share":
+        return all(side.folder.fixed.passes(side.configuration) for side in sides)
+    return all(side.folder.fixed.known(side.configuration) for side in sides)
+
+
+def _rows(regret: Regret, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool) -> Iterator[dict[str, object]]:
+    """A row of all logs, then, where there are several, one for each.
+
+    `pair`: all rows that both sides have. `fixed`: the metric is the same in every run.
+    """
+    yield _row(regret, pair, grid, draws, fixed=fixed) | {"log": ALL, "log_ix": ALL_LOGS}
     for k, name in enumerate(grid.logs if len(grid.logs) > 1 else ()):
         of_log = replace(regret, figure=regret.figure.take(regret.figure.whose.log_ix == k))
-        yield _row(of_log, pair.take(pair.log_ix == k), grid, draws) | {"log": name, "log_ix": k}
+        yield _row(of_log, pair.take(pair.log_ix == k), grid, draws, fixed=fixed) | {"log": name, "log_ix": k}
 
 
-def _row(regret: Regret, pair: Whose, grid: Grid, draws: Draws) -> dict[str, object]:
+def _row(regret: Regret, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool) -> dict[str, object]:
     figure = regret.figure
     value, other, difference = figure.values()
     row: dict[str, object] = {"value": _number(value), "baseline_value": _number(other), "n": int(figure.n.sum())}
     row["difference"] = _number(difference)
-    drawn = clusters(figure.whose, resampled_over(pair), grid)
-    if drawn is not None and math.isfinite(difference) and (figure.by_object or drawn.over != "objects"):
-        low, high = percentile_limits(figure.resampled(drawn, draws.counts(drawn.names)), clusters=len(drawn.names))
-        row |= {"low": _number(low), "high": _number(high), "interval_over": drawn.over}
+    row |= limits(figure, difference, pair, grid, draws, fixed=fixed)
     if figure.only is not None:
         only = figure.only.sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}

@@ -10,7 +10,8 @@ from typing import Self
 
 import numpy as np
 
-from copem_replay.compare.intervals import Clusters, Counts, Whose
+from copem_replay.compare.intervals import Clusters, Whose
+from copem_replay.intervals import Counts
 from copem_replay.paired import resampled_medians, resampled_sums
 from copem_replay.statistics import CENSORED, DETECTED, cumulative_incidence, quantile_with_never, restricted_mean
 from copem_replay.tracks import Bool, Float, Int
@@ -20,7 +21,8 @@ from copem_replay.tracks import Bool, Float, Int
 class Figure(ABC):
     """A figure of two configurations from the same items (i,).
 
-    `n (i,)`: how many pairs (rows, lists) each stands for. `only (i, 2)`: which of a row's two sides alone succeeded.
+    `n (i,)`: how many pairs (rows, lists) each stands for. `only (i, 2)`, of shares: which of a row's two sides alone
+    succeeded.
     `by_object`: whether objects can be resampled, what an item counts being known for each.
     """
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from copem_replay.belongings import check_still
 from copem_replay.errors import InputError
+from copem_replay.fixed import Fixed, fixed_in
 from copem_replay.measure_keys import Measure
 from copem_replay.plain_yaml import NotYamlError, read
 
@@ -73,6 +74,7 @@ class Folder:
     measure: dict[str, Any]
     braking: dict[str, Any] | None
     ego: object
+    fixed: Fixed  # what is the same in every run
     by_truth_id: frozenset[str]  # configurations that detect by truth id: the truth, and ideal fusion
     horizon_used_s: float | None
     tables: dict[str, pa.Table]
@@ -112,7 +114,9 @@ def read_folder(path: Path) -> Folder:
     check_still(path, seen)
     always = bool(fields["measure"]["match"].get("always"))
     by_id = frozenset() if always else frozenset(_by_truth_id(experiment.get("configurations")))
-    return Folder(path=path, ego=experiment.get("ego"), by_truth_id=by_id, tables=tables, **fields)
+    return Folder(
+        path=path, ego=experiment.get("ego"), by_truth_id=by_id, fixed=fixed_in(experiment), tables=tables, **fields
+    )
 
 
 def _rowless(path: Path) -> bool:

@@ -1,6 +1,6 @@
 """Intervals of differences: which clusters are resampled whole, and with which draws.
 
-The clusters are those of `summary.csv`, drawn by the same dice: logs, if there are at least five; else measured
+The clusters are those of `summary.csv`, resampled alike: logs, if there are at least five; else measured
 objects, if there are at least five; runs, where there is one object in one log. With fewer there is no interval: more
 runs do not tell about other traffic, and few of anything do not tell how it varies.
 """
@@ -11,15 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from copem_replay.chance import Address, Dice, object_words
 from copem_replay.compare.grid import Grid
-from copem_replay.paired import multiplicities
-from copem_replay.summary import FEWEST_CLUSTERS, RESAMPLES
+from copem_replay.intervals import Resamples, resamples
+from copem_replay.summary import FEWEST_CLUSTERS
 from copem_replay.tracks import Bool, Int
 
-Counts = NDArray[np.uint32]
 _KEPT = 4
 """Sets of clusters whose draws are kept (chosen: few differ, and each may be large)."""
 
@@ -41,18 +38,15 @@ class Draws:
     """Resamples of clusters, addressed by their names: the same clusters are drawn alike for every metric."""
 
     def __init__(self, seed: int) -> None:
-        self._dice = Dice(seed, "summary")
-        self._kept: dict[tuple[str, ...], Counts] = {}
+        self._seed = seed
+        self._kept: dict[tuple[str, ...], Resamples] = {}
 
-    def counts(self, names: tuple[str, ...]) -> Counts:
-        """(R, K) how often each cluster is drawn."""
+    def of(self, names: tuple[str, ...]) -> Resamples:
+        """How often each cluster is in each resample."""
         if names not in self._kept:
-            zeros = np.zeros(len(names), dtype=np.int64)
-            address = Address(("",), zeros, object_words(names), zeros)
-            drawn = multiplicities(self._dice.uniform("bootstrap", address, np.arange(RESAMPLES)))
             while len(self._kept) >= _KEPT:
                 del self._kept[next(iter(self._kept))]
-            self._kept[names] = drawn
+            self._kept[names] = resamples(names, self._seed)
         return self._kept[names]
 
 

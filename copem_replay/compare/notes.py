@@ -84,7 +84,7 @@ def note_on_measuring(baseline: Named, others: Sequence[Named]) -> Iterator[str]
 def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
     """Intervals that there are not, and ghosts fewer than `asked` per minute."""
     overall = table.drop_duplicates(["configuration", "metric"])
-    without = overall[overall["difference"].notna() & overall["interval_over"].isna()]
+    without = overall[overall["difference"].notna() & overall["interval"].isna()]
     with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
     nameless = (without["metric"] == "ghosts_per_min") & without["configuration"].isin(with_interval)
     if nameless.any():

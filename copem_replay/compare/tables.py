@@ -11,8 +11,10 @@ import pandas as pd
 
 from copem_replay.atomic import atomic_file
 from copem_replay.compare.comparison import Comparison
+from copem_replay.compare.limits import ALL_ALIKE
 from copem_replay.compare.regret import METRICS
 from copem_replay.errors import OutputError
+from copem_replay.fixed import NOTHING_DRAWN
 from copem_replay.table import as_text
 from copem_replay.wording import printable
 
@@ -20,6 +22,8 @@ _SUFFIXES = (".csv", ".md")
 _RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
 NOTHING = 1e-9
 """Closer to 0 than this is 0 (chosen: below what any of the metrics is measured with)."""
+_WITHOUT = {ALL_ALIKE: "all alike", NOTHING_DRAWN: NOTHING_DRAWN}
+"""How it is said in a cell that there is no interval, and why."""
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -66,13 +70,18 @@ def _cells(comparison: Comparison) -> pd.DataFrame:
 
 
 def _cell(row: Any) -> str:
-    """`+0.12 [0.05, 0.2]`; a dash where there is no difference."""
+    """`+0.12 [0.05, 0.2]`; `+0.12 (all alike)`; a dash where there is no difference."""
     if row is None or pd.isna(row.difference):
         return "–"
     if pd.isna(row.interval_over):
-        return signed(row.difference)
+        return " ".join([signed(row.difference), *(f"({why})" for why in without_interval(row))])
     low, high = ("–" if pd.isna(limit) else plain(limit) for limit in (row.low, row.high))
     return f"{signed(row.difference)} [{low}, {high}]"
+
+
+def without_interval(row: Any) -> list[str]:
+    """Why a difference has no interval, in a word or two; nothing where it has one, or where clusters are too few."""
+    return [_WITHOUT[row.interval]] if row.interval in _WITHOUT else []
 
 
 def signed(value: float) -> str:
@@ -94,6 +103,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     kinds = [kind if len(over) == 1 else f"{kind} ({', '.join(metrics)})" for kind, metrics in over.items()]
     if kinds:
         yield f"[95 %]: bootstrap interval over {'; '.join(kinds)}"
+    yield from _on_intervals(overall)
     yield (
         f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that, who "
         "was still there at the end as censored"
@@ -120,3 +130,19 @@ def in_markdown(text: str) -> str:
     """Text that reads as itself, on one line, in Markdown and in the HTML that it becomes."""
     html = re.sub("[&<>]", lambda found: _HTML[found[0]], printable(text))
     return _MARKDOWN.sub(r"\\\g<0>", html)
+
+
+def _on_intervals(overall: pd.DataFrame) -> Iterator[str]:
+    """Which differences have other intervals, or none, because there is nothing to resample."""
+    kinds = {kind: list(dict.fromkeys(of["metric"])) for kind, of in overall.groupby("interval", sort=False)}
+    if "exact" in kinds:
+        yield (
+            f"{', '.join(kinds['exact'])}: exact binomial limits where the difference is the same in every cluster, "
+            "for resamples then are all the same, too"
+        )
+    if ALL_ALIKE in kinds:
+        yield (
+            f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, so that nothing tells how it varies"
+        )
+    if NOTHING_DRAWN in kinds:
+        yield f"({_WITHOUT[NOTHING_DRAWN]}): every run is the same, so that an interval over runs would tell nothing"

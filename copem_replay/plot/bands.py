@@ -1,8 +1,8 @@
 """Bands around curves of detection: 95 % by drawing whole clusters of rows with replacement.
 
 Clusters are what hangs together: the runs of the one measured object; else logs, or objects, where there are at least
-five; with fewer there is no band. Draws are addressed, so that every configuration resamples the same clusters, and the
-logs or objects are those of the intervals in `summary.csv`. Letters: n rows, K clusters, R resamples, G instants.
+five; with fewer there is no band. Limits are, instant by instant, those of a share in `summary.csv` (intervals.py):
+every configuration resamples the same clusters. Letters: n rows, K clusters, R resamples, G instants.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from copem_replay.chance import Address, Dice, object_words
+from copem_replay.intervals import Counts, effective_number, percentile_limits, resamples, widened
 from copem_replay.statistics import CENSORED, DETECTED
 from copem_replay.tracks import Float, Int
 
@@ -19,15 +19,6 @@ RESAMPLES = 400
 """Of a band (chosen: its limits are then off by about 1 % of what lies between them)."""
 _CELLS = 4_000_000
 """Resamples × rows held at a time (chosen: 32 MB a column)."""
-
-
-def multiplicities(names: Sequence[str], seed: int, *, resamples: int = RESAMPLES) -> Int:
-    """(R, K) how often each cluster is drawn in each resample: K draws with replacement."""
-    none = np.zeros(len(names), dtype=np.int64)
-    address = Address(("",), none, object_words(names), none)
-    uniform = Dice(seed, "summary").uniform("bootstrap", address, np.arange(resamples))
-    drawn = (uniform * len(names)).astype(np.int64) + len(names) * np.arange(resamples)[:, None]
-    return np.bincount(drawn.ravel(), minlength=resamples * len(names)).reshape(resamples, len(names))
 
 
 def band(
@@ -38,21 +29,23 @@ def band(
     `time_s (n,)`, `ending (n,)` as in `statistics.cumulative_incidence`; `cluster (n,)`: the name of each row's.
     """
     names, of = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
-    counts = multiplicities(list(names), seed)
+    resampled = resamples([str(name) for name in names], seed, RESAMPLES)
     # Rows of one cluster that end alike at one time are one row that counts as often.
     order = np.lexsort((of, ending, time_s))
     keys = np.stack([time_s, ending, of])[:, order]
     first = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
     alike = np.diff(np.append(first, len(order)))
     kept = order[first]
+
+    def curves(count: Counts) -> Float:
+        return resampled_incidence(time_s[kept], ending[kept], count[:, of[kept]].astype(np.int64) * alike, at_s)
+
     size = max(1, _CELLS // max(len(kept), len(at_s)))
-    curves = np.concatenate(
-        [
-            resampled_incidence(time_s[kept], ending[kept], counts[k : k + size, of[kept]] * alike, at_s)
-            for k in range(0, len(counts), size)
-        ]
-    )
-    low, high = np.quantile(curves, ((1 - confidence) / 2, (1 + confidence) / 2), axis=0)
+    blocks = [curves(resampled.count[k : k + size]) for k in range(0, len(resampled.count), size)]
+    share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(of))
+    limits = [percentile_limits(at, resampled, confidence=confidence) for at in np.concatenate(blocks).T]
+    of_all = [widened(*one, n, confidence=confidence)[1:] for one in zip(limits, share.tolist(), strict=True)]
+    low, high = np.array(of_all).reshape(-1, 2).T
     return low, high
 
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from copem_replay.fixed import fixed_in
 from copem_replay.plot.appearance import add_note, appearances, new_figure, style
-from copem_replay.plot.bands import RESAMPLES, band
+from copem_replay.plot.bands import band
 from copem_replay.plot.captions import list_rates, short_names, study
 from copem_replay.plot.folder import Results
 from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence
@@ -59,12 +60,7 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     With 95 % bands, unless there are too many of them, and the exact curves, where there are some.
     """
     names = results.chosen(configurations)
-    over, cluster = clusters(results.table)
-    curves = {}
-    for name in names:
-        rows = results.table["configuration"] == name
-        banded = over is not None and len(names) <= MOST_BANDS
-        curves[name] = curve_of(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
+    over, curves = curves_of(results, names, bands=len(names) <= MOST_BANDS)
     exact = {name: exact_curve(results.exact, name) for name in names} if results.exact is not None else {}
     with style():
         figure = _drawn(results, curves, exact)
@@ -79,6 +75,18 @@ def endings(rows: pd.DataFrame) -> tuple[Float, Int]:
     looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
     return time_s, np.where(detected, DETECTED, np.where(left, LEFT, CENSORED))
+
+
+def curves_of(results: Results, names: Sequence[str], *, bands: bool = True) -> tuple[str | None, dict[str, Curve]]:
+    """What is resampled whole, and the curves of configurations, with bands where there is something to resample."""
+    over, cluster = clusters(results.table)
+    fixed = fixed_in(results.experiment.as_written())
+    curves = {}
+    for name in names:
+        rows = results.table["configuration"] == name
+        banded = bands and over is not None and not (over == "runs" and fixed.known(name))
+        curves[name] = curve_of(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
+    return over, curves
 
 
 def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Curve:
@@ -170,7 +178,7 @@ def _steps(times_s: Float, values: Float | None, begin_s: float, end_s: float) -
 def _note(
     figure: Figure, results: Results, names: Sequence[str], over: str | None, curves: dict[str, Curve], exact: bool
 ) -> None:
-    bands = f"Bands: 95 %, bootstrap over whole {over} ({RESAMPLES} resamples)"
+    bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
     if over is None:
         few = f"fewer than {FEWEST_CLUSTERS}"
         bands = f"No bands: {few} logs and {few} objects, and more runs do not tell about other traffic"

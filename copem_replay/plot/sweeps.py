@@ -16,6 +16,7 @@ from copem_replay.plot.appearance import Appearance, add_note, appearances, new_
 from copem_replay.plot.captions import list_rates, short_names
 from copem_replay.plot.folder import Results
 from copem_replay.tracks import Float
+from copem_replay.wording import interval_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -141,6 +142,13 @@ def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
     axes.set_xlabel(AXES.get(kind, kind))
 
 
+def _interval_kinds(sweep: pd.DataFrame) -> list[str]:
+    if "interval_over" not in sweep or "interval" not in sweep:
+        return []
+    there = sweep[["interval", "interval_over"]].dropna().drop_duplicates()
+    return sorted(interval_words(*of) for of in there.itertuples(index=False))
+
+
 def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
     n = sorted({int(value) for value in sweep["n"].dropna()}) if "n" in sweep else []
     rows = f", n = {n[0] if n[0] == n[-1] else f'{n[0]} to {n[-1]}'} per point" if n else ""
@@ -149,13 +157,8 @@ def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Se
         if kind != "rate_hz":
             rates = list_rates(sweep[sweep["sweep"] == kind], names)
             said.append(f"{AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else "")
-    over = sorted(set(sweep["interval_over"].dropna())) if "interval_over" in sweep else []
-    interval = sorted(set(sweep["interval"].dropna())) if "interval" in sweep else []
-    said.append(
-        f"Bands of shares: 95 %, {', '.join(interval).replace('wilson', 'Wilson')} over {', '.join(over)}"
-        if over
-        else "No intervals of the shares"
-    )
+    kinds = _interval_kinds(sweep)
+    said.append(f"Bands of shares: 95 %, {'; '.join(kinds)}" if kinds else "No intervals of the shares")
     said.append("Dashed black: exact, what the runs tend to" if _any_exact(sweep) else "")
     if "ttd_p95_s" in sweep and sweep["ttd_p95_s"].isna().any():
         said.append(

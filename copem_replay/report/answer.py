@@ -8,7 +8,9 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.compare import Comparison
+from copem_replay.compare.limits import ALL_ALIKE
 from copem_replay.compare.tables import NOTHING, plain, signed
+from copem_replay.fixed import NOTHING_DRAWN
 from copem_replay.plot.captions import percent
 from copem_replay.report.described import some
 from copem_replay.report.markup import Html, joined, listed, tag
@@ -82,7 +84,8 @@ def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFr
     """Differences to the best: that are later, cannot be told from none, are sooner, and have no interval."""
     rows = _of(lead, RANKED_BY)
     rows = rows[rows["difference"].notna()].sort_values("difference", kind="stable")
-    unsure = rows["interval_over"].isna() | rows["low"].isna() | rows["high"].isna()
+    same = rows["interval"].isin([ALL_ALIKE, NOTHING_DRAWN]) & (rows["difference"].abs() <= NOTHING)
+    unsure = (rows["interval_over"].isna() | rows["low"].isna() | rows["high"].isna()) & ~same
     later = ~unsure & (rows["low"] > NOTHING)
     sooner = ~unsure & (rows["high"] < -NOTHING)
     return rows[later], rows[~unsure & ~later & ~sooner], rows[sooner], rows[unsure]
@@ -90,7 +93,7 @@ def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFr
 
 def _equal(alike: pd.DataFrame) -> pd.DataFrame:
     """Of those that cannot be told from the best the ones that do not differ at all."""
-    return alike[(alike[["difference", "low", "high"]].abs() <= NOTHING).all(axis=1)]
+    return alike[(alike[["difference", "low", "high"]].fillna(0.0).abs() <= NOTHING).all(axis=1)]
 
 
 def _others(study: Study) -> Iterator[str]:
@@ -216,7 +219,12 @@ def _truth(study: Study) -> Iterator[str]:
 
 
 def _how_sure(study: Study) -> str:
-    over = study.results.summary["interval_over"].dropna()
+    over, kind = (study.results.summary[name].dropna() for name in ("interval_over", "interval"))
+    if not len(over) and (kind == NOTHING_DRAWN).any():
+        return (
+            "How sure: there are no intervals, for every run is the same: recorded lists and the truth are not drawn. "
+            "What is said holds for this one object; more runs would not tell about other traffic."
+        )
     if not len(over):
         return (
             f"How sure: there are no intervals, for there are fewer than {FEWEST_CLUSTERS} logs and fewer than "
@@ -230,8 +238,8 @@ def _how_sure(study: Study) -> str:
         "logs": "how far other recordings of this kind might differ",
     }[str(over.iloc[0])]
     return (
-        f"How sure: intervals are 95 %, in brackets, over {over.iloc[0]}. They say {tells}. Where all are alike an "
-        "interval is a point, which is no certainty."
+        f"How sure: intervals are 95 %, in brackets, over {over.iloc[0]}. They say {tells}. A difference that is "
+        "the same throughout has none: how it varies is not known."
     )
 
 

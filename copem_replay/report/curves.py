@@ -7,13 +7,12 @@ import math
 import numpy as np
 
 from copem_replay.plot.appearance import Appearance
-from copem_replay.plot.bands import RESAMPLES
 from copem_replay.plot.captions import percent
-from copem_replay.plot.curves import Curve, curve_of, exact_curve, time_axis
+from copem_replay.plot.curves import Curve, curves_of, exact_curve, time_axis
 from copem_replay.report.drawing import Drawn, axis, card, label, layout, line_of, numbers, outlined, place, rgb, swatch
 from copem_replay.report.markup import Html, joined, tag
 from copem_replay.report.study import Study
-from copem_replay.summary import FEWEST_CLUSTERS, clusters
+from copem_replay.summary import FEWEST_CLUSTERS
 from copem_replay.table import cell
 from copem_replay.tracks import Float
 
@@ -25,13 +24,7 @@ _MOST_BANDS = 3
 def curves(study: Study) -> tuple[Html, list[Drawn]]:
     """The section, and its figures: all curves in one; where they are many, bands in a small figure of each."""
     results = study.results
-    over, cluster = clusters(results.table)
-    drawn: dict[str, Curve] = {}
-    for name in study.names:
-        rows = results.table["configuration"] == name
-        drawn[name] = curve_of(
-            results.table[rows], cluster[rows] if over is not None else None, results.experiment.seed
-        )
+    over, drawn = curves_of(results, study.names)
     exact = {name: exact_curve(results.exact, name) for name in study.names} if results.exact is not None else {}
     limits = time_axis([*drawn.values(), *exact.values()])
     one_by_one = len(study.names) > _MOST_BANDS
@@ -58,7 +51,7 @@ def curves(study: Study) -> tuple[Html, list[Drawn]]:
 
 def _said(drawn: dict[str, Curve], over: str | None, limits: tuple[float, float], exact: bool, many: bool) -> list[str]:
     later = max((curve.last - _by(curve, limits[1]) for curve in drawn.values()), default=0.0)
-    bands = f"Bands: 95 %, bootstrap over whole {over} ({RESAMPLES} resamples)"
+    bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
     if over is None:
         bands = (
             f"No bands: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} measured objects, and more "

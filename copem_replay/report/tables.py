@@ -12,11 +12,11 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.compare.regret import METRICS
-from copem_replay.compare.tables import comparison_lines, plain, signed
+from copem_replay.compare.tables import comparison_lines, plain, signed, without_interval
 from copem_replay.report.drawing import swatch
 from copem_replay.report.markup import Html, breakable, joined, listed, table, tag
 from copem_replay.report.study import Study
-from copem_replay.table import cell
+from copem_replay.table import cell, intervals_said
 
 _COUNTS = ("n", "n_conflict")
 _INTERVALS = {"detected_share": "interval", "pass_share": "pass_interval"}
@@ -138,11 +138,8 @@ def _interval(study: Study, part: Part, columns: Iterable[str]) -> Html:
     of = next((name for name in columns if name in _INTERVALS), None)
     if of is None:
         return Html()
-    column = _INTERVALS[of]
-    rows = study.results.summary
-    over, kind = rows[f"{column}_over"].dropna(), rows[column].dropna()
-    if len(over):
-        return tag("p", f"[95 %] {of}: {kind.iloc[0].replace('wilson', 'Wilson')} interval over {over.iloc[0]}.")
+    if said := intervals_said(study.results.summary, _INTERVALS[of]):
+        return joined(tag("p", f"{of}, {line}.") for line in said)
     return tag("p", f"No interval of {of}: too few logs and objects, and more runs do not tell about other traffic.")
 
 
@@ -207,6 +204,7 @@ def _difference(row: Any, metric: str) -> Html:
     shown = [signed(row.difference)]
     if pd.notna(row.interval_over):
         shown.append(interval(*("–" if pd.isna(limit) else plain(limit) for limit in limits)))
+    shown += [f" ({why})" for why in without_interval(row)]
     low, high = map(full, limits)
     return tag("td", *shown, data_column=metric, data_value=full(row.difference), data_low=low, data_high=high)
 
