@@ -66,7 +66,7 @@ def run(
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
     notes += [f"{replay.scene.log}: {note}" for replay in ready for note in _notes(replay, experiment)]
-    notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
+    notes += without_points(experiment)
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):

@@ -399,6 +399,8 @@ class TestFigures:
         figures = [figure for figure in json.loads(found.data) if figure["id"].startswith("sweep-")]
         titles = [figure["layout"]["xaxis"]["title"]["text"] for figure in figures]
         assert titles == ["Latency (s)"] * 3 + ["Rate of the units (lists per second)"] * 3
+        shown = [{trace["name"] for trace in figure["data"]} for figure in figures]
+        assert shown == [{"late (latency swept)"}] * 3 + [{"late", "half"}] * 3, "half has no latency to vary"
         for figure in figures:
             go.Figure(data=figure["data"], layout=figure["layout"])
 
