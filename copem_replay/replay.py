@@ -32,7 +32,7 @@ from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
 from copem_replay.sight import first_sights, in_sight_s
 from copem_replay.stretches import ROWS_A_STRETCH, WHOLE, Reach, Stretch, stretches
-from copem_replay.tracks import Bool, Float, Int, Scene, Tracks, spliced
+from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, spliced
 from copem_replay.units import Placed, place
 
 BLOCK_BYTES = 200_000_000
@@ -43,6 +43,9 @@ STATE_BYTES = 400
 
 WORTH_A_BLOCK = 1_000_000
 """Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
+
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
@@ -409,7 +412,8 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Beli
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
-    """For each configuration how many intervals between fused lists there are, and the seconds they cover.
+    """For each configuration how many intervals there are between fused lists issued while the log lasts, and the
+    seconds they cover.
 
     Units that only some runs have are taken to be there.
     """
@@ -419,5 +423,6 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world.truth, world.experiment, configuration)
         issue_s = instants(heard, max_age_s=configuration.max_age_s).issue_s
+        issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= world.scene.end_s + _TOLERANCE_S)]
         rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
     return rates
