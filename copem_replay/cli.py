@@ -161,6 +161,7 @@ def run(
 
     result = _with_progress(lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress))
     notes = write_results(folder, ready, recordings, result, skipped=skipped, overwrite=overwrite, viewer=url)
+    notes += result.costs
     _complain([f"note: {path}: skipped: {reason}" for path, reason in skipped] + [f"note: {note}" for note in notes])
     print(summary_text(result.summary))
     if result.sweep is not None:
