@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -93,6 +94,8 @@ class Appraiser:
         self, around: Surroundings, looks: Looks, believed: Believed, issue_s: Float, measure: Measure
     ) -> None:
         self._issue_s, self._measure = issue_s, measure
+        self.accuracy_s = 0.0
+        """How long measuring accuracy took, matching not counted."""
         runs = len(believed.lists.start)
         self._known = FirstMatches(
             looks, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
@@ -112,9 +115,11 @@ class Appraiser:
         lists, issue_s = believed.lists, believed.at.issue_s
         self._known.add(lists, matches, issue_s)
         if self._assessment is not None:
+            began_s = time.perf_counter()
             whole = len(issue_s) == len(self._issue_s)
             captures = self._captures if whole else self._next_to(lists.entries["captured_s"])
             self._assessment.add(lists, matches, around.at(issue_s), around.at(captures))
+            self.accuracy_s += time.perf_counter() - began_s
         return matches
 
     def _next_to(self, captured_s: Float) -> Float:

@@ -169,7 +169,7 @@ def run(
             lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress, ready=prepared)
         )
         notes = fill_place(place, ready, recordings, result, skipped=skipped, viewer=url)
-        notes = place.notes + [f"{path}: skipped: {reason}" for path, reason in skipped] + notes
+        notes = place.notes + [f"{path}: skipped: {reason}" for path, reason in skipped] + notes + list(result.costs)
         _complain(f"note: {note}" for note in notes)
         print(summary_text(result.summary))
         if result.sweep is not None:

@@ -205,14 +205,34 @@ def _once(values: tuple[float, ...]) -> tuple[float, ...]:
     return values
 
 
-class Sweep(Frozen):
-    """Values of one quantity at a time at which the configurations (by default all that it changes) are run, too.
+SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
 
+
+class SweptBy(Frozen):
+    """Which configurations each quantity changes, where not all change the same ones."""
+
+    latency_s: SweptNames | None = None
+    rate_hz: SweptNames | None = None
+    units: SweptNames | None = None
+    share: SweptNames | None = None
+
+
+def _swept_by(value: object) -> str:
+    return "by" if isinstance(value, dict | SweptBy) else "names"
+
+
+Swept = Annotated[Annotated[SweptNames, Tag("names")] | Annotated[SweptBy, Tag("by")], Discriminator(_swept_by)]
+
+
+class Sweep(Frozen):
+    """Values of one quantity at a time at which `configurations` are run, too: names, or names by quantity.
+
+    By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
     `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
     `units`: how many of a configuration's units beside the ego's, the first ones. `share`: of those who carry a unit.
     """
 
-    configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+    configurations: Swept | None = None
     latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
@@ -222,7 +242,17 @@ class Sweep(Frozen):
     def _some(self) -> Self:
         if not (self.latency_s or self.rate_hz or self.units or self.share):
             raise ValueError("expected values of latency_s, rate_hz, units or share, such as `latency_s: [0, 0.5, 1]`")
+        for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
+            if self.chosen(quantity) and not getattr(self, quantity):
+                raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")
         return self
+
+    def chosen(self, quantity: str) -> tuple[str, ...] | None:
+        """The configurations that a quantity shall change; None: nothing is said of it."""
+        if not isinstance(self.configurations, SweptBy):
+            return self.configurations
+        chosen: tuple[str, ...] | None = getattr(self.configurations, quantity)
+        return chosen
 
 
 class Read(Frozen):

@@ -120,9 +120,12 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
     if not isinstance(sweep, dict):
         return
     named, configurations = sweep.get("configurations"), _names(data.get("configurations"))
-    for k, name in enumerate(named if isinstance(named, list) else []):
-        if _is_name(name) and str(name) not in configurations:
-            yield source.at(("sweep", "configurations", k), unknown("configuration", name, configurations))
+    by_quantity = named.items() if isinstance(named, dict) else [(None, named)]
+    for quantity, names in by_quantity:
+        where: Key = ("sweep", "configurations", *([] if quantity is None else [quantity]))
+        for k, name in enumerate(names if isinstance(names, list) else []):
+            if _is_name(name) and str(name) not in configurations:
+                yield source.at((*where, k), unknown("configuration", name, configurations))
     carried = [name for name, unit in _items(data.get("units")) if isinstance(unit.get("on"), dict)]
     if sweep.get("share") and not carried:
         yield source.at(("sweep", "share"), "no unit is `on: {classes, share}`")

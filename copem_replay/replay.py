@@ -4,6 +4,7 @@ function of it, so that blocks can be computed anywhere, in any order, by any nu
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,7 +33,7 @@ from copem_replay.recorded import RecordedUnits, recorded_units
 from copem_replay.resample import at_instants
 from copem_replay.sight import first_sights, in_sight_s
 from copem_replay.stretches import ROWS_A_STRETCH, ROWS_HELD, WHOLE, Reach, Stretch, candidate_rows, stretches
-from copem_replay.tracks import Bool, Float, Int, Scene, Tracks, spliced
+from copem_replay.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, spliced
 from copem_replay.units import Placed, place
 
 BLOCK_BYTES = 200_000_000
@@ -43,6 +44,9 @@ STATE_BYTES = 400
 
 WORTH_A_BLOCK = 1_000_000
 """Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
+
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
@@ -166,12 +170,17 @@ class Replay:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a block of runs (S,) gave: rows of `detections.parquet`, and by configuration how good the lists were."""
+    """What a block of runs (S,) gave: rows of `detections.parquet`, and by configuration how good the lists were.
+
+    `worked_s`, `accuracy_s`: how long it took, and how much of that `measure: {accuracy: false}` would have spared.
+    """
 
     log: str
     runs: Int
     table: pd.DataFrame
     appraisals: dict[str, Appraisal]
+    worked_s: float
+    accuracy_s: float
 
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
@@ -214,9 +223,13 @@ def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
 
 def _needs_all(experiment: Experiment) -> bool:
     """Whether anything goes by whole lists, and not only by whether they hold a measured object."""
-    measure = experiment.measure
+    return experiment.measure.accuracy or _matches(experiment)
+
+
+def _matches(experiment: Experiment) -> bool:
+    """Whether anything is known by match, for which lists are needed whether their accuracy is measured or not."""
     others = any(not by_truth(configuration) for configuration in experiment.configurations.values())
-    return measure.accuracy or measure.match.always or others
+    return experiment.measure.match.always or others
 
 
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
@@ -239,11 +252,11 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
 
 def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | None, there: Bool | None) -> Outcome:
     """What runs (S,) give: `equipped (S, U)` says which units list anything, `there (U,)` which send lists at all."""
-    measure = experiment.measure
+    measure, began_s = experiment.measure, time.perf_counter()
     sight_s = _in_sight(replay, experiment, equipped, there)
     events = _by_truth_id(replay, experiment, runs, equipped, there, sight_s)
     appraisals: dict[str, Appraisal] = {}
-    everything = _needs_all(experiment)
+    everything, accuracy_s, lists_s = _needs_all(experiment), 0.0, time.perf_counter()
     if everything or measure.conflict is not None:
         receivers = Receivers(runs, there)
         judges: dict[str, _Judge] = {}
@@ -261,9 +274,12 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool | N
                     events[name] = Events(judge.units, appraisal.detections, sight_s[name])
             if foreseen_s is not None:
                 events[name] = replace(events[name], foreseen_s=foreseen_s)
+            accuracy_s += judge.accuracy_s
+        if not _matches(experiment) and measure.conflict is None:  # for nothing else
+            accuracy_s = time.perf_counter() - lists_s
     ordered = {name: events[name] for name in experiment.configurations}
     rows = table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, ordered)
-    return Outcome(replay.scene.log, runs, rows, appraisals)
+    return Outcome(replay.scene.log, runs, rows, appraisals, time.perf_counter() - began_s, accuracy_s)
 
 
 class _Judge:
@@ -296,6 +312,11 @@ class _Judge:
                 belief = as_belief(believed.lists, s, matches, believed.heard, believed.at.issue_s, believed.at.newest)
                 self._foreseeing.add(belief, s)
         self._foreseeing.next(believed.at.issue_s)
+
+    @property
+    def accuracy_s(self) -> float:
+        """How long measuring accuracy took."""
+        return 0.0 if self._appraiser is None else self._appraiser.accuracy_s
 
     def result(self) -> tuple[Appraisal | None, Float | None]:
         appraisal = None if self._appraiser is None else self._appraiser.result(self._runs)
@@ -417,7 +438,8 @@ def believed(replay: Replay, experiment: Experiment, run: int) -> dict[str, Beli
 
 
 def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
-    """For each configuration how many intervals between fused lists there are, and the seconds they cover.
+    """For each configuration how many intervals there are between fused lists issued while the log lasts, and the
+    seconds they cover.
 
     Units that only some runs have are taken to be there.
     """
@@ -427,5 +449,6 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world.truth, world.experiment, configuration)
         issue_s = instants(heard, max_age_s=configuration.max_age_s).issue_s
+        issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= world.scene.end_s + _TOLERANCE_S)]
         rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
     return rates

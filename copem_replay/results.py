@@ -28,6 +28,7 @@ from copem_replay.plain_yaml import dump
 from copem_replay.read import Recording
 from copem_replay.run import Result, log_path_of
 from copem_replay.shown import ShownRun, one_run, shown_logs, shown_runs
+from copem_replay.sweep import resolved
 
 _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
@@ -97,7 +98,7 @@ def _fill(
     scratch: Path, folder: Path, experiment: Experiment, recordings: Sequence[Recording], result: Result,
     skipped: Sequence[tuple[Path, str]], viewer: str | None,
 ) -> list[str]:  # fmt: skip
-    data = experiment.as_written()
+    data = resolved(experiment).as_written()
     data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
@@ -140,7 +141,7 @@ def _show(
     summary = result.summary[result.summary["configuration"].isin(list(chosen.configurations))]
     manifest = {
         "copem_replay": version("copem-replay"),
-        "experiment": dump(experiment.as_written() | {"logs": [log_path_of(recordings, log).name]}),
+        "experiment": dump(resolved(experiment).as_written() | {"logs": [log_path_of(recordings, log).name]}),
         "log": log,
         "run": str(shown.run),
         "run_is": shown.why,

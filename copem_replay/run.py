@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from copem_replay import replay as replays
 from copem_replay.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
+from copem_replay.cost import Cost, watched
 from copem_replay.exact import check_exact, exact_table
 from copem_replay.experiment import Experiment
 from copem_replay.fixed import fixed_in
@@ -39,6 +41,7 @@ class Result:
     exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
     accuracy: AccuracyTables | None = None  # with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
+    costs: tuple[str, ...] = ()  # what has to be said on the terminal alone: no two runs take the same time
 
 
 def run(
@@ -54,12 +57,18 @@ def run(
     `ready`: the logs as they were prepared and checked before. Raises ExperimentError before any run: something that
     has no closed form, runs that no memory holds.
     """
-    if ready is None:
-        ready = [replays.prepare(recording, experiment) for recording in recordings]
-        check_closed_form(ready, experiment)
-        memory_notes(ready, experiment)
+    with watched() as cost:
+        if ready is None:
+            ready = [replays.prepare(recording, experiment) for recording in recordings]
+            check_closed_form(ready, experiment)
+            memory_notes(ready, experiment)
+        tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)), cost)
+        result = _run(experiment, recordings, ready, tables)
+    return replace(result, costs=cost.notes())
+
+
+def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables) -> Result:
     exact = _exactly(ready, experiment)
-    tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)))
     table, parts, order = tables.of(ready, experiment)
     horizon = horizon_s(table, experiment.measure.horizon_s)
     rows, said = summary(
@@ -97,7 +106,7 @@ def notes_of(
     for replay in ready:
         met = replay.ever_met if replayed else None
         notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
-    notes += [f"sweep of {kind}: it changes no configuration" for kind in without_points(experiment)]
+    notes += without_points(experiment)
     if experiment.measure.accuracy and not _same_units(ready):
         notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
     return notes
@@ -140,8 +149,8 @@ def _exactly(ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame | 
 class _Tables:
     """Tables of all logs and runs, computed in blocks by several workers; tells how far it is."""
 
-    def __init__(self, jobs: int, progress: Progress | None, tables: int) -> None:
-        self._jobs, self._progress, self._tables, self._done = jobs, progress, tables, 0
+    def __init__(self, jobs: int, progress: Progress | None, tables: int, cost: Cost) -> None:
+        self._jobs, self._progress, self._tables, self._done, self._cost = jobs, progress, tables, 0, cost
 
     def of(
         self, ready: Sequence[Replay], experiment: Experiment
@@ -149,7 +158,7 @@ class _Tables:
         """The rows of `detections.parquet` of an experiment; all outcomes, and the order their rows have got."""
         work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, self._jobs)]
         parts: list[list[Outcome]] = []
-        pool = ThreadPoolExecutor(self._jobs)
+        pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
         try:
             for part in pool.map(lambda item: replays.outcomes(item[0], experiment, item[1]), work):
                 parts.append(part)
@@ -159,6 +168,7 @@ class _Tables:
             pool.shutdown(cancel_futures=True)
         self._done += 1
         every = [outcome for part in parts for outcome in part]
+        self._cost.add(time.perf_counter() - began_s, every)
         table = pd.concat([with_accuracy(outcome) for outcome in every], ignore_index=True)
         order = _order(table, [replay.scene.log for replay in ready], experiment)
         return table.iloc[order].reset_index(drop=True), every, order

@@ -1,7 +1,8 @@
 """Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
 
 A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `share` the units themselves.
-Configurations that it leaves as they are, or makes equal to one before, are left out.
+Configurations that it leaves as they are, or makes equal to one before, are left out. A latency is varied only where
+there is one (above 0, or by unit) or where the configuration is named: who hears of nobody over the air has none.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from copem_replay.experiment import Carriers, Configuration, Experiment, Unit
+from copem_replay.experiment import Carriers, Configuration, Experiment, SweptBy, Unit
 from copem_replay.measure_keys import Measure
 from copem_replay.tracks import TRUTH
 
@@ -50,12 +51,40 @@ def points(experiment: Experiment) -> Iterator[Point]:
                 yield Point(kind, float(value), at)
 
 
+def resolved(experiment: Experiment) -> Experiment:
+    """The same experiment with `sweep.configurations` said: the list, or one for each quantity where they differ."""
+    sweep = experiment.sweep
+    if sweep is None or isinstance(sweep.configurations, tuple):
+        return experiment
+    swept = {kind: values for kind in KINDS if (values := getattr(sweep, kind))}
+    names = {
+        kind: sweep.chosen(kind)
+        or tuple(name for name, curve in _curves(experiment, kind, values).items() if any(curve))
+        for kind, values in swept.items()
+    }
+    first, *others = names.values()
+    if not any(names.values()):
+        return experiment
+    alike = all(other == first for other in others)
+    said = first if alike else SweptBy(**{kind: of_kind for kind, of_kind in names.items() if of_kind})
+    return experiment.model_copy(update={"sweep": sweep.model_copy(update={"configurations": said})})
+
+
 def without_points(experiment: Experiment) -> list[str]:
-    """Sweeps of an experiment that no configuration is changed by."""
+    """Sweeps of an experiment that no configuration is changed by, and what would help."""
     if experiment.sweep is None:
         return []
     there = {point.sweep for point in points(experiment)}
-    return [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in there]
+    none = [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in there]
+    return [f"sweep of {kind}: it changes no configuration{_unstated(experiment, kind)}" for kind in none]
+
+
+def _unstated(experiment: Experiment, kind: str) -> str:
+    assert experiment.sweep is not None
+    heard = [c for c in experiment.configurations.values() if c.units != TRUTH and not c.latency_s]
+    if kind != "latency_s" or experiment.sweep.chosen(kind) or not heard:
+        return ""
+    return "; none states a latency above 0 or by unit, and `sweep: {configurations: […]}` does not name any"
 
 
 def _measured(experiment: Experiment) -> Measure:
@@ -71,9 +100,11 @@ def _curves(
     """What becomes of each configuration at each value; None: it has no such value."""
     curves: dict[str, tuple[Configuration | None, ...]] = {}
     assert experiment.sweep is not None
-    wanted = experiment.sweep.configurations or tuple(experiment.configurations)
+    chosen = experiment.sweep.chosen(kind)
     for name, configuration in experiment.configurations.items():
-        if name not in wanted or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
+        # A latency that is not above 0 is one only where it is given by unit, or the configuration is named.
+        wanted = name in chosen if chosen is not None else kind != "latency_s" or bool(configuration.latency_s)
+        if not wanted or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
             continue
         curve = tuple(_configuration_at(experiment, configuration, kind, value) for value in values)
         if curve not in curves.values():

@@ -583,7 +583,7 @@ class TestSweeps:
         exact = [[list(v) for v in one.get_data()] for one in passes.get_lines() if one.get_label() == "exact"]
         assert exact == [[[0, 0.5], [0.91, 0.79]], [[0], [1.0]]]
         names = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert names == ["late", "GT", "exact"]
+        assert names == ["late (latency swept)", "late", "GT (latency swept)", "exact"]
         (drawn,) = (c for c in detected.collections if c.get_label() == "band of late")
         assert {tuple(v) for v in drawn.get_paths()[0].vertices} == {(0, 0.9), (0, 1), (0.5, 0.8), (0.5, 1)}
         # The 95 % quantile at 0.5 s is among the never detected: the band goes on beyond the axis.

@@ -182,7 +182,11 @@ class TestWords:
 
     def test_without_intervals_it_says_so(self, tmp_path: Path) -> None:
         lines = lines_of(replayed(tmp_path, changed()))
-        assert lines[2].endswith("; how sure that is, no interval tells.")
+        assert re.fullmatch(
+            r"2 objects, so no interval\. half has the shortest mean time, \S+ s "
+            r"\(never detected counting as 4\.5 s\)\.",
+            lines[2],
+        )
         assert lines[3].startswith("After it, by differences without an interval: late (+")
         assert "[" not in lines[3]
         assert any(
@@ -195,6 +199,53 @@ class TestWords:
         lines = lines_of(replayed(tmp_path, text))
         assert lines[2].startswith("half and hit knew at the very same times: after ")
         assert not any("No difference" in line or "cannot be told" in line for line in lines)
+
+    def test_who_knows_at_once_ties(self, tmp_path: Path) -> None:
+        """Of units that surely see both objects at the onset none is the first; of two objects there is no interval."""
+        second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
+        lines = lines_of(replayed(tmp_path, changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second)))
+        assert lines[2] == "half and second knew at once; 2 objects, so no interval. The other 2 are below."
+        assert re.match(
+            r"After it, by differences without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[3]
+        )
+        assert not any("shortest" in line or "soonest" in line for line in lines)
+        three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
+        text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])
+        lines = lines_of(replayed(tmp_path / "all", text))
+        assert lines[2] == "late, half and second knew at once; 2 objects, so no interval."
+        assert not lines[3].startswith("After it")
+
+    def test_the_same_mean_at_other_times_is_a_tie_too(self, tmp_path: Path) -> None:
+        """One unit sees only the one object, the other only the other: at once and never, whichever it is."""
+        pems = "  one: [{when: {range_m: [0, 28]}, detection: {kind: constant, probability: 1.0}}]\n"
+        pems += "  other: [{when: {range_m: [28, 60]}, detection: {kind: constant, probability: 1.0}}]\n"
+        text = changed(
+            ("  blind:", pems + "  blind:"),
+            ("measure: {onset", "measure: {horizon_s: 0.1, onset"),
+            ("pem: half}", "pem: other}"), ("  eye: {", "  near: {on: ego, height_m: 1.8, pem: one}\n  eye: {"),
+            ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [near]}"), ALONE[1], ALONE[3],
+        )  # fmt: skip
+        lines = lines_of(replayed(tmp_path, text))
+        assert lines[2] == (
+            "2 objects, so no interval. hit and half have the same mean time, 0.05 s (never detected counting as 0.1 "
+            "s), though they did not always know at the same time."
+        )
+
+    def test_of_equal_lists_none_is_the_best(self, tmp_path: Path) -> None:
+        """Braking and GOSPA name all that are equal, and say first that means have no interval."""
+        second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
+        blind = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [eye]}")
+        text = changed(ONE, ("  half: {units: [weak]}", "  half: {units: [ego]}"), second, blind)
+        lines = lines_of(replayed(tmp_path, text))
+        [best] = [line for line in lines if line.startswith("The best lists")]
+        assert re.match(
+            r"The best lists, places, misses and false entries taken together, by means without an interval, had half "
+            r"and second: GOSPA 0 m, against \S+ m with late and never\.",
+            best,
+        )
+        [braking] = [line for line in lines if line.startswith("Braking")]
+        assert "pass with half, second, 0 % [" in braking
+        assert "with late, never" in braking
 
     def test_an_interval_that_includes_0_is_no_difference(self, tmp_path: Path) -> None:
         """Another unit that lists him every other time, by draws of its own."""
@@ -451,6 +502,8 @@ class TestFigures:
         figures = [figure for figure in json.loads(found.data) if figure["id"].startswith("sweep-")]
         titles = [figure["layout"]["xaxis"]["title"]["text"] for figure in figures]
         assert titles == ["Latency (s)"] * 3 + ["Rate of the units (lists per second)"] * 3
+        shown = [{trace["name"] for trace in figure["data"]} for figure in figures]
+        assert shown == [{"late (latency swept)"}] * 3 + [{"late", "half"}] * 3, "half has no latency to vary"
         for figure in figures:
             go.Figure(data=figure["data"], layout=figure["layout"])
 

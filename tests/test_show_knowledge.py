@@ -87,7 +87,7 @@ def test_lanes_tell_when_a_configuration_knew(hiding: Made) -> None:
     assert lane(hiding.path, "4 pedestrian", 2) == [(0, "both known")]
     style = static(hiding.path, "/lanes/2\\ pedestrian")
     colour_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:colors"], strict=True))
-    assert len(colour_of) == 3 * len(STATUSES)
+    assert len(colour_of) == 3 * len(STATUSES) + 3, "and before, since and after the look"
     known = [colour_of[f"{name} known"] >> 8 for name in ("GT", "PEM", "both")]
     boxes = [at(hiding.path, f"/world/{name}/boxes", 1.2)["Boxes3D:colors"][0] >> 8 for name in ("GT", "PEM", "both")]
     assert known == boxes
@@ -279,7 +279,7 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
     from copem_replay.show.sight import sight
-    from copem_replay.show.status import CAPTURED, KNOWN, LOST, status_of
+    from copem_replay.show.status import CAPTURED, KNOWN, LOST, clock_of, status_of
 
     belief = hiding.beliefs["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
@@ -287,7 +287,8 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     silent = belief.fused.valid & (belief.fused.arrives_s[:, belief.fused.frame_ix] > 0.45)
     lossy = replace(belief, heard=replace(belief.heard, arrives_s=arrives), fused=replace(belief.fused, valid=silent))
     seen = sight(hiding.replay, hiding.given, [hiding.replay.scene.object_number["4"]])
-    made = status_of(hiding.replay, hiding.given, "both", lossy, seen)
+    clock = clock_of(hiding.replay.scene, hiding.table, "both")
+    made = status_of(hiding.replay, hiding.given, "both", lossy, seen, clock)
     early = made.elapsed_ns < 450_000_000
     assert set(made.status[early, 0].tolist()) == {LOST}
     assert set(made.status[~early, 0].tolist()) == {KNOWN}

@@ -26,7 +26,7 @@ from copem_replay.experiment_file import load, log_paths
 from copem_replay.read import Recording
 from copem_replay.replay import Replay, prepare
 from copem_replay.run import run
-from copem_replay.sweep import KINDS, Point, points
+from copem_replay.sweep import KINDS, Point, points, resolved
 from experiments import changed, drive, source_of
 from scenes import Thing, driving, experiment, recording, standing
 
@@ -95,13 +95,13 @@ class TestPoints:
         assert only(plan()) == []
 
     def test_latency_is_that_of_the_whole_list_or_the_default_one(self) -> None:
-        """`late` becomes the same as `all`, and is left out; the truth is not swept."""
+        """`late` becomes the same as `all`, and is left out; the truth is not swept, nor what states no latency."""
         zero, more = only(plan({"latency_s": [0, 0.2]}))
         assert (zero.sweep, zero.value, more.value) == ("latency_s", 0.0, 0.2)
         late = {name: c.latency_s for name, c in more.experiment.configurations.items()}
-        assert late == {"PEM": 0.2, "all": 0.2, "mixed": {"ego": 0.0, "default": 0.2}, "masts": 0.2, "one": 0.2}
+        assert late == {"all": 0.2, "mixed": {"ego": 0.0, "default": 0.2}}
         assert zero.experiment.configurations["mixed"].latency_s == {"ego": 0.0, "default": 0.0}
-        assert zero.experiment.configurations["masts"].latency_s == 0
+        assert zero.experiment.configurations["all"].latency_s == 0
         for point in (zero, more):
             assert point.experiment.units == plan().units
             assert point.experiment.sweep is None
@@ -111,6 +111,36 @@ class TestPoints:
         (point,) = only(plan({"latency_s": [0.7]}, configurations=mixed))
         (configuration,) = point.experiment.configurations.values()
         assert [configuration.latency_of(name) for name in UNITS] == [0.7, 0.1, 0.7, 0.7]
+
+    def test_a_latency_of_0_is_one_where_it_is_by_unit(self) -> None:
+        """Above 0 or by unit: what a vehicle sees itself arrives at once, at every latency of the others."""
+        given = {
+            "alone": {"units": ["ego"]},
+            "said": {"units": ["ego"], "latency_s": 0.0},
+            "none": {"units": "all", "latency_s": {}},
+            "remote": {"units": "all", "latency_s": {"ego": 0.0}},
+            "late": {"units": "all", "latency_s": 0.001},
+            "truth": {"units": "truth", "latency_s": 0.5},
+        }
+        assert told(plan({"latency_s": [0.0, 1]}, configurations=given)) == [
+            ("latency_s", 0.0, ["remote", "late"]),
+            ("latency_s", 1.0, ["remote", "late"]),
+        ]
+
+    def test_who_is_named_has_its_latency_varied(self) -> None:
+        wanted = plan({"latency_s": [0.4], "rate_hz": [5], "configurations": ["PEM", "mixed"]})
+        assert told(wanted) == [("latency_s", 0.4, ["PEM", "mixed"]), ("rate_hz", 5, ["PEM", "mixed"])]
+        assert only(wanted)[0].experiment.configurations["PEM"].latency_s == 0.4
+
+    def test_by_quantity(self) -> None:
+        """What is not said of one quantity is as by default."""
+        by = {"latency_s": ["PEM"], "units": ["late", "masts"]}
+        wanted = plan({"latency_s": [0.4], "rate_hz": [5], "units": [1], "configurations": by})
+        assert told(wanted) == [
+            ("latency_s", 0.4, ["PEM"]),
+            ("rate_hz", 5, ["PEM", "all", "late", "mixed", "masts", "one"]),
+            ("units", 1, ["late", "masts"]),
+        ]
 
     def test_rate_is_that_of_every_unit(self) -> None:
         slow, fast = only(plan({"rate_hz": [5, 12.5]}))
@@ -162,7 +192,8 @@ class TestPoints:
 
     def test_what_becomes_equal_at_all_values_is_there_once(self) -> None:
         """`late` has a life of its own as soon as it is not its latency that varies."""
-        twins = {"x": {"units": ["a", "ego"]}, "y": {"units": ["ego", "a"]}, "z": {"units": ["a", "ego"]}}
+        heard = {"x": ["a", "ego"], "y": ["ego", "a"], "z": ["a", "ego"]}
+        twins = {name: {"units": units, "latency_s": 0.1} for name, units in heard.items()}
         wanted = plan({"units": [0, 1], "latency_s": [0.1]}, configurations=twins | {"late": CONFIGURATIONS["late"]})
         assert told(wanted) == [
             ("latency_s", 0.1, ["x", "y", "late"]),
@@ -233,6 +264,47 @@ class TestPoints:
         assert told(plan({"latency_s": [0, 0.5]}, configurations={"one": configuration})) == []
 
 
+class TestResolved:
+    """The list that is written is the one that was swept, and gives the same again."""
+
+    @staticmethod
+    def said(sweep: dict[str, Any], **changes: Any) -> Any:
+        wanted = plan(sweep, **changes)
+        again = resolved(wanted)
+        assert told(again) == told(wanted)
+        assert again.model_copy(update={"sweep": None}) == wanted.model_copy(update={"sweep": None})
+        assert again.sweep is not None
+        assert Experiment.model_validate(again.as_written()) == again
+        return again.sweep.model_dump(exclude_none=True).get("configurations")
+
+    def test_one_list(self) -> None:
+        assert self.said({"latency_s": [0, 1]}) == ("all", "mixed")
+        assert self.said({"rate_hz": [5]}) == ("PEM", "all", "late", "mixed", "masts", "one")
+        both = {name: CONFIGURATIONS[name] for name in ("all", "mixed")}
+        assert self.said({"latency_s": [0, 1], "rate_hz": [5]}, configurations=both) == ("all", "mixed")
+
+    def test_a_list_for_each_quantity_where_they_differ(self) -> None:
+        assert self.said({"latency_s": [1], "units": [0, 1], "rate_hz": [5]}) == {
+            "latency_s": ("all", "mixed"),
+            "rate_hz": ("PEM", "all", "late", "mixed", "masts", "one"),
+            "units": ("all", "late", "mixed", "masts", "one"),
+        }
+        fresh = {name: CONFIGURATIONS[name] for name in ("PEM", "masts")}
+        assert self.said({"latency_s": [1], "units": [1]}, configurations=fresh) == {"units": ("masts",)}
+
+    def test_what_is_given_stays(self) -> None:
+        assert self.said({"latency_s": [1], "units": [1], "configurations": ["GT", "PEM"]}) == ("GT", "PEM")
+        by = {"latency_s": ["GT", "PEM"]}
+        assert self.said({"latency_s": [1], "units": [1], "configurations": by}) == {
+            "latency_s": ("GT", "PEM"),
+            "units": ("all", "late", "mixed", "masts", "one"),
+        }
+
+    def test_nothing_to_say(self) -> None:
+        assert self.said({"latency_s": [1]}, configurations={"PEM": CONFIGURATIONS["PEM"]}) is None
+        assert resolved(plan()) == plan()
+
+
 # -------------------------------------------------------------------------------------------------- the results
 
 
@@ -266,10 +338,16 @@ def alike(found: pd.DataFrame, expected: pd.DataFrame) -> None:
 class TestResults:
     @pytest.mark.parametrize("latency", [0.0, 0.25, 5.0])
     def test_latency(self, latency: float) -> None:
-        found = rows_at(swept({"latency_s": [1.0, latency]}), "latency_s", latency)
+        names = ["PEM", "all", "mixed", "masts", "one"]
+        found = rows_at(swept({"latency_s": [1.0, latency], "configurations": names}), "latency_s", latency)
         late = {name: c | {"latency_s": latency} for name, c in CONFIGURATIONS.items()}
         late["mixed"] = CONFIGURATIONS["mixed"] | {"latency_s": {"ego": 0.0, "default": latency}}
-        alike(found, plainly(["PEM", "all", "mixed", "masts", "one"], configurations=late))
+        alike(found, plainly(names, configurations=late))
+
+    def test_who_has_no_latency_stays_as_it_is(self) -> None:
+        """The ego by itself does not come to know later because others' lists take longer."""
+        found = swept({"latency_s": [0, 3]}, runs=3)
+        assert set(found["configuration"]) == {"all", "mixed"}
 
     @pytest.mark.parametrize("rate", [2.0, 10.0, 33.3])
     def test_rate(self, rate: float) -> None:
@@ -372,12 +450,12 @@ def test_a_sweep_of_several_logs() -> None:
     """Over all of them together, as in the summary."""
     logs = [crossing(), recording([Thing("ego", "car", standing(0, 0)), Thing("7", "car", standing(9, 9)),
                                    Thing("w", "pedestrian", standing(15, 0))], until_s=1.0, log="other")]  # fmt: skip
-    found = run(plan({"latency_s": [0.4]}), logs).sweep
+    found = run(plan({"latency_s": [0.4], "configurations": ["PEM", "all"]}), logs).sweep
     assert found is not None
     late = {name: c | {"latency_s": 0.4} for name, c in CONFIGURATIONS.items() if name in ("all", "PEM")}
     expected = without_accuracy(run(plan(configurations=late), logs).summary)
     part = rows_at(found, "latency_s", 0.4)
-    alike(part[part["configuration"].isin(["PEM", "all"])].reset_index(drop=True), expected)
+    alike(part, expected)
 
 
 # ----------------------------------------------------------------------------------------------- files and commands
@@ -423,14 +501,12 @@ class TestFiles:
         assert header == ["sweep", "value", *(summary[0][k] for k in kept)]
         assert "ttd_rmst_s_exact" in header
         assert [(row[0], row[1], row[2]) for row in lines] == [
-            ("latency_s", "0", "PEM"), ("latency_s", "0", "coPEM"), ("latency_s", "0.25", "PEM"),
-            ("latency_s", "0.25", "coPEM"), ("latency_s", "0.1", "PEM"), ("latency_s", "0.1", "coPEM"),
+            ("latency_s", "0", "coPEM"), ("latency_s", "0.25", "coPEM"), ("latency_s", "0.1", "coPEM"),
             ("rate_hz", "5", "PEM"), ("rate_hz", "5", "coPEM"), ("rate_hz", "20", "PEM"), ("rate_hz", "20", "coPEM"),
             ("units", "0", "coPEM"), ("units", "1", "coPEM"),
         ]  # fmt: skip
         # At the values the experiment has itself: the rows of its summary.
         by_name = {row[0]: [row[k] for k in kept] for row in summary[1:]}
-        assert lines[0][2:] == by_name["PEM"]
         assert lines[-1][2:] == by_name["coPEM"]
 
     def test_only_where_there_is_a_sweep(self, call: Call, tmp_path: Path) -> None:
@@ -460,6 +536,16 @@ class TestFiles:
 
     def test_the_experiment_that_is_written_gives_the_same(self, call: Call, tmp_path: Path) -> None:
         fleet = "  mast: {on: {classes: [car, vru], share: 0.5}, pem: onboard}"
+        chosen = SWEEP.replace("}", ", share: [0.25]}")
+        (tmp_path / "d.yaml").write_text(changed(fleet, EXACT, chosen))
+        call("run", "d.yaml", "--out", "c")
+        call("run", "c/experiment.yaml", "--out", "d")
+        assert written(tmp_path / "c") == written(tmp_path / "d")
+        by_default = problems(load(tmp_path / "c" / "experiment.yaml"))[0]
+        assert by_default is not None
+        assert by_default.sweep is not None
+        assert by_default.sweep.chosen("latency_s") == ("coPEM",)
+        assert by_default.sweep.chosen("rate_hz") == ("PEM", "coPEM")
         chosen = SWEEP.replace("{", "{configurations: [coPEM], ").replace("}", ", share: [0.25]}")
         (tmp_path / "e.yaml").write_text(changed(fleet, EXACT, chosen))
         call("run", "e.yaml", "--out", "a")
@@ -524,6 +610,20 @@ class TestCheck:
                 ["sweep: {configurations: [], latency_s: [0]}"],
                 ["19: sweep.configurations: expected at least 1 in the list, found []"],
             ),
+            (["sweep: {configurations: {latency_s: [coPEM]}, latency_s: [0]}"], []),
+            (
+                ["sweep: {configurations: {latency_s: [PEM, coPEN]}, latency_s: [0]}"],
+                ["19: sweep.configurations.latency_s[1]: no configuration is named 'coPEN'; did you mean coPEM?"],
+            ),
+            (
+                ["sweep: {configurations: {latencys: [PEM]}, latency_s: [0]}"],
+                ["19: sweep.configurations.latencys: unknown key; did you mean latency_s?"],
+            ),
+            (
+                ["sweep: {configurations: {units: [PEM]}, latency_s: [0]}"],
+                ["19: sweep: configurations.units: expected values of units beside it, found none"],
+            ),
+            (["sweep: {configurations: 3, latency_s: [0]}"], ["19: sweep.configurations: expected a list, found 3"]),
             (["sweep: {latency_s: [0, -1]}"], ["19: sweep.latency_s[1]: expected at least 0, found -1"]),
             (["sweep: {rate_hz: [0]}"], ["19: sweep.rate_hz[0]: expected at least 0.001, found 0"]),
             (
@@ -657,6 +757,13 @@ def test_a_sweep_that_changes_nothing_is_said() -> None:
     found = run(plan({"latency_s": [0, 1]}, configurations=truth), [crossing()])
     assert found.sweep is None
     assert "sweep of latency_s: it changes no configuration" in found.notes
+    fresh = truth | {"PEM": {"units": ["ego"]}}
+    found = run(plan({"latency_s": [0, 1]}, configurations=fresh), [crossing()])
+    assert found.sweep is None
+    assert (
+        "sweep of latency_s: it changes no configuration; none states a latency above 0 or by unit, and `sweep: "
+        "{configurations: […]}` does not name any"
+    ) in found.notes
     units = {"ego": UNITS["ego"], "buses": {"on": {"classes": ["bus"], "share": 0.5}, "pem": "p"}}
     found = run(plan({"share": [0, 1]}, units=units, configurations={"all": {"units": "all"}}), [crossing()])
     assert any(note.endswith("unit buses: the log has nobody to carry it (bus)") for note in found.notes)

@@ -119,6 +119,23 @@ class TestOncomingCar:
         # The ego's lists come at every frame, the other's in between or with them: still 10 instants a second.
         assert of(result, "both")["list_rate_hz"] == pytest.approx(10.0)
 
+    def test_lists_are_counted_while_the_log_lasts(self) -> None:
+        """8 s: the ego's 81 lists come at once; of the other's, from 0.05 s on and 4 s late, the 40 until 7.95 s do.
+
+        120 intervals in 8 s; with all that arrives until 11.95 s it would be 160, 13.4 a second.
+        """
+        late = {"ego": 0.0, "default": 4.0}
+        result = replayed(
+            scenes.oncoming_car(),
+            units={"ego": EGO_UNIT, "rsu": {"at": [30, 5], "height_m": 5.0, "pem": "all", "rate_hz": 10.0,
+                                            "phase_s": 0.05}},
+            configurations={"both": {"units": "all", "latency_s": late}, "rsu": {"units": ["rsu"], "latency_s": late},
+                            "never": {"units": "all", "latency_s": 8.5}},
+        )  # fmt: skip
+        assert of(result, "both")["list_rate_hz"] == pytest.approx(15.0)
+        assert of(result, "rsu")["list_rate_hz"] == pytest.approx(10.0)
+        assert of(result, "never")["list_rate_hz"] is None or np.isnan(of(result, "never")["list_rate_hz"])
+
     def test_only_behind_is_not_ahead(self) -> None:
         behind = [{"when": {"azimuth_deg": [150, -150]}, "detection": {"kind": "constant", "probability": 1.0}}]
         result = replayed(scenes.oncoming_car(), pems={"sure": behind})

@@ -6,7 +6,7 @@ Made of `sweep.csv`: the columns of `summary.csv`, and which `sweep` and `value`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +21,7 @@ from copem_replay.wording import interval_words
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 _BEYOND_S = 1e9
 """Stands for never where a band is drawn: above every axis (chosen)."""
@@ -66,17 +67,26 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
                 axes.set_ylim(-0.03, 1.05)
                 axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
         _close_open_bands(panels[-1])
-        short = short_names(wanted)
-        handles = {line.get_label(): line for axes in panels.ravel() for line in axes.get_lines()}
-        named = [name for name in (*wanted, "exact") if name in handles]
-        figure.legend(
-            [handles[name] for name in named],
-            [short.get(name, name) for name in named],
-            loc="outside right upper",
-            handlelength=3.2,
-        )
+        _legend(figure, panels, kinds, wanted)
         add_note(figure, _note(results, sweep, kinds, wanted))
     return figure
+
+
+def swept_name(name: str, kind: str) -> str:
+    """What a configuration is called where a quantity is swept: its own name may tell the latency it no longer has."""
+    return f"{name} (latency swept)" if kind == "latency_s" else name
+
+
+def _legend(figure: Figure, panels: Any, kinds: Sequence[str], names: Sequence[str]) -> None:
+    """A configuration that is drawn with its latency swept and as it is, too, is there twice."""
+    short = short_names(names)
+    handles: dict[str, Line2D] = {}
+    for name in (*names, "exact"):
+        for column, kind in zip(panels.T, kinds, strict=True):
+            drawn = [line for axes in column for line in axes.get_lines() if line.get_label() == name]
+            if drawn:
+                handles.setdefault(name if name == "exact" else swept_name(short[name], kind), drawn[0])
+    figure.legend(list(handles.values()), list(handles), loc="outside right upper", handlelength=3.2)
 
 
 def _series(axes: Axes, rows: pd.DataFrame, what: str, name: str, look: Appearance) -> None:

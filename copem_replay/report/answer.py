@@ -12,9 +12,10 @@ from copem_replay.compare.limits import ALL_ALIKE
 from copem_replay.compare.tables import NOTHING, plain, signed
 from copem_replay.fixed import NOTHING_DRAWN
 from copem_replay.plot.captions import percent
-from copem_replay.report.described import some
+from copem_replay.report.described import some, together
 from copem_replay.report.markup import Html, joined, listed, tag
 from copem_replay.report.study import RANKED_BY, Study
+from copem_replay.report.ties import as_soon_as_the_best, at_once, no_interval
 from copem_replay.summary import FEWEST_CLUSTERS
 from copem_replay.table import cell
 from copem_replay.wording import counted
@@ -62,22 +63,42 @@ def _soonest(study: Study) -> Html:
         alone = "it is the only configuration" if len(study.names) == 1 else "only the truth stands beside it"
         return joined([name, f" knew after {cell(mean_s)} s on the average ({counted_as}). There is nothing to compare "
                        f"it with: {alone}."])  # fmt: skip
-    later, alike, sooner, _ = _told_apart(study.lead)
-    same = _equal(alike)
-    if len(same):
-        names = " and ".join([some([study.best, *same["configuration"]][:-1]), str(same["configuration"].iloc[-1])])
-        rest = len(study.lead.configurations) - len(same)
-        whom = f" The other {rest} are below." if rest > 1 else " The other is below." if rest else ""
-        return joined([tag("b", names), f" knew at the very same times: after {cell(mean_s)} s on the average "
-                       f"({counted_as}).{whom}"])  # fmt: skip
+    same = as_soon_as_the_best(study)
+    if len(same) == 1:
+        return _first(study, name, mean_s, counted_as)
+    unsure = _told_apart(study.lead)[3]
+    unsure = unsure[unsure["configuration"].isin(same)]
+    when = (
+        "at once" if at_once(study) else f"at the very same times: after {cell(mean_s)} s on the average ({counted_as})"
+    )
+    why = f"; {no_interval(study, unsure)}" if len(unsure) else ""
+    rest = len(study.lead.configurations) + 1 - len(same)
+    whom = f" The other {rest} are below." if rest > 1 else " The other is below." if rest else ""
+    return joined([tag("b", together(same)), f" knew {when}{why}.{whom}"])
+
+
+def _first(study: Study, name: Html, mean_s: float, counted_as: str) -> Html:
+    """Where no other knew at the same times as the best. That there is no interval is said before who it is."""
+    assert study.lead is not None
+    later, alike, sooner, unsure = _told_apart(study.lead)
     undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
+    before = ""
+    if len(unsure):
+        why = no_interval(study, unsure)
+        of = f" of the difference to {some(list(unsure['configuration']))}" if len(unsure) < others else ""
+        before = f"{why[:1].upper()}{why[1:]}{of}. "
+    level = list(unsure.loc[unsure["difference"].abs() <= NOTHING, "configuration"])
+    if level:
+        names = tag("b", together([str(study.best), *level]))
+        return joined([before, names, f" have the same mean time, {cell(mean_s)} s ({counted_as}), though they did not "
+                       "always know at the same time."])  # fmt: skip
     whom = f"the other {others}" if others > 1 else study.lead.configurations[0]
-    has, sure = f" has the shortest mean time, {cell(mean_s)} s", "; how sure that is, no interval tells"
+    has, sure = f" has the shortest mean time, {cell(mean_s)} s", ""
     if len(later) == others:
         has, sure = f" knew soonest, after {cell(mean_s)} s on the average", f", sooner than {whom}"
     elif undecided:
         sure = f", but cannot be told from {f'{undecided} of ' if undecided < others else ''}{whom}"
-    return joined([name, f"{has} ({counted_as}){sure}."])
+    return joined([before, name, f"{has} ({counted_as}){sure}."])
 
 
 def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
@@ -91,19 +112,15 @@ def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFr
     return rows[later], rows[~unsure & ~later & ~sooner], rows[sooner], rows[unsure]
 
 
-def _equal(alike: pd.DataFrame) -> pd.DataFrame:
-    """Of those that cannot be told from the best the ones that do not differ at all."""
-    return alike[(alike[["difference", "low", "high"]].fillna(0.0).abs() <= NOTHING).all(axis=1)]
-
-
 def _others(study: Study) -> Iterator[str]:
     """The others by whether their difference to the best can be told from none."""
     if study.lead is None:
         return
-    later, alike, sooner, unsure = _told_apart(study.lead)
+    same = as_soon_as_the_best(study)
+    later, alike, sooner, unsure = (rows[~rows["configuration"].isin(same)] for rows in _told_apart(study.lead))
+    unsure = unsure[unsure["difference"].abs() > NOTHING]
     if len(later):
         yield f"Later than that, the interval of the difference excluding 0: {_each(later)}."
-    alike = alike.drop(_equal(alike).index)
     if len(alike):
         yield (
             f"No difference to it can be shown, the interval including 0: {_each(alike)}. That is not to say that "
@@ -176,11 +193,11 @@ def _passes(study: Study) -> Iterator[str]:
         return
     share = judged["pass_share"].astype(float)
     best, worst = str(share.idxmax()), str(share.idxmin())
-    alike = [str(name) for name in share.index[share == share[best]]]
+    alike, last = ([str(name) for name in share.index[share == share[one]]] for one in (best, worst))
     said = f"Braking: of {counted(int(judged.loc[best, 'n_conflict']), 'row')} in conflict "
     said += f"{_share(judged.loc[best])} pass with {some(alike)}"
     if len(alike) < len(share):
-        said += f", {_share(judged.loc[worst])} with {worst}"
+        said += f", {_share(judged.loc[worst])} with {some(last)}"
     if study.regret is not None and best != study.baseline:
         found = _of(study.regret, "pass_share").set_index("configuration")
         if best in found.index and pd.notna(found.loc[best, "difference"]):
@@ -205,10 +222,11 @@ def _accuracy(study: Study) -> Iterator[str]:
     own = rows.loc[known.index, "list_rate_hz"].round(2).nunique() > 1
     more = "; each over its own lists, of which some have more than others" if own else ""
     if len(known) > 1 and known.min() < known.max():
-        best, worst = str(known.idxmin()), str(known.idxmax())
+        best, worst = (list(known.index[(known - one).abs() <= NOTHING]) for one in (known.min(), known.max()))
         yield (
-            f"The best lists, places, misses and false entries taken together, had {best}: GOSPA "
-            f"{cell(known[best])} m, against {cell(known[worst])} m with {worst}{more}."
+            "The best lists, places, misses and false entries taken together, by means without an interval, had "
+            f"{together(best)}: GOSPA {cell(known.min())} m, against {cell(known.max())} m with {together(worst)}"
+            f"{more}."
         )
 
 

@@ -23,6 +23,11 @@ def some(names: Sequence[str]) -> str:
     return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"
 
 
+def together(names: Sequence[str]) -> str:
+    """`A, B and C`; the first of them where they are many."""
+    return f"{some(names[:-1])} and {names[-1]}" if 1 < len(names) <= _NAMED else some(names)
+
+
 def logs(study: Study) -> str:
     """Which recordings."""
     names = [file.name for file in study.results.logs]

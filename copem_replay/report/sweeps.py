@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from copem_replay.plot.sweeps import AXES
+from copem_replay.plot.sweeps import AXES, swept_name
 from copem_replay.report.drawing import Drawn, axis, label, layout, line_of, numbers, outlined, place, rgb
 from copem_replay.report.markup import Html, joined, tag
 from copem_replay.report.study import Study
@@ -69,7 +69,7 @@ def _figure(id_: str, study: Study, part: pd.DataFrame, kind: str, what: str) ->
             "type": "scatter",
             "mode": "lines+markers",
             "meta": k,
-            "name": label(name),
+            "name": label(swept_name(name, kind)),
             "x": numbers(rows["value"].to_numpy(dtype=float), 6),
             "y": numbers(middle, 6),
             "line": line_of(look, max(look.width_pt * 0.7, 1.5)),

@@ -9,7 +9,7 @@
 | `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; who listed it |
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where it was first known, and from how far away |
 | `world/eye` | what the eye follows |
-| `lanes/<object>` | absent, out of view, hidden, visible, captured, known: a lane per configuration |
+| `lanes/<object>` | how far it has come (`status.py`): a lane per configuration, and one since the onset |
 | `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
 | `plots/visible_share/<object>/mark 1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | believed to true position at the instant the list is available |

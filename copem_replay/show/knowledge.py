@@ -12,23 +12,28 @@ from copem_replay.experiment import Configuration, Experiment
 from copem_replay.fusion.belief import Belief
 from copem_replay.fusion.instants import instants
 from copem_replay.replay import Replay
+from copem_replay.show.marks import ONSET
 from copem_replay.show.out import Out, f32, ns, object_labels, part_of, short_ids
 from copem_replay.show.sight import Sight
 from copem_replay.show.status import (
     ABSENT,
     CAPTURED,
+    EARLY,
     HIDDEN,
     KNOWN,
     LOST,
     OUT,
     STATUSES,
+    TOO_LATE,
+    UNCONFIRMED,
     UNLISTED,
     UNMATCHED,
     VISIBLE,
+    Clock,
     Status,
 )
 from copem_replay.show.units import unit_places
-from copem_replay.tracks import TRUTH, Int, Scene
+from copem_replay.tracks import TRUTH, Bool, Int, Scene
 
 HIDES: Rgb = (255, 70, 60)
 NOTICED: Rgb = (255, 255, 255)
@@ -45,12 +50,17 @@ LANES: Mapping[int, Rgb] = {
     HIDDEN: (130, 45, 40),
     VISIBLE: (115, 115, 115),
     LOST: (120, 50, 90),
+    CAPTURED: (70, 80, 105),
     UNMATCHED: (120, 90, 30),
 }
-"""Of statuses in which nobody knows; captured has the configuration's colour darkened, known its own."""
+"""Of statuses in which the receiver has nothing; what is listed has the configuration's colour at half its strength,
+what is known all of it."""
+CLOCK = ("before the onset", "since the onset", "no longer looked at")
+CLOCK_TINTS: tuple[Rgb, ...] = (LANES[ABSENT], ONSET, LANES[ABSENT])
+"""Of a lane of its own under those of the configurations: the same for all of them."""
 
 
-def words(out: Out, name: str, replay: Replay, experiment: Experiment, seen: Sight, made: Status) -> None:
+def words(out: Out, name: str, replay: Replay, experiment: Experiment, seen: Sight, made: Status, clock: Clock) -> None:
     """Over each object, where it truly is: “2 hidden from ego by 3 (share 0.12)”."""
     import rerun as rr
 
@@ -60,33 +70,40 @@ def words(out: Out, name: str, replay: Replay, experiment: Experiment, seen: Sig
     colours = np.full((len(rows), 3), WAITING, dtype=np.uint8)
     at = made.status[rows, column]
     colours[at == HIDDEN], colours[at == KNOWN] = HIDES, NOTICED
-    labels = _told(replay.scene, experiment, seen, made, rows, column)
+    started = made.elapsed_ns[rows] >= clock.onset_ns[seen.object_ix[column]]
+    labels = _told(replay.scene, experiment, seen, made, rows, column, started)
     columns = rr.Points3D.columns(positions=place, labels=labels, colors=colours)
     path = ["world", part_of(name), "status"]
     out.columns(path, made.elapsed_ns, columns.partition(np.bincount(rows, minlength=len(made.elapsed_ns))))
     out.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5), show_labels=True))
 
 
-def _told(scene: Scene, experiment: Experiment, seen: Sight, made: Status, rows: Int, column: Int) -> pa.Array:
-    """(P,) in words; each sentence is made once."""
+def _told(
+    scene: Scene, experiment: Experiment, seen: Sight, made: Status, rows: Int, column: Int, started: Bool
+) -> pa.Array:
+    """(P,) in words; each sentence is made once. `started`: whether the object's clock runs."""
     frame, status, unit = np.maximum(made.frame[rows], 0), made.status[rows, column], made.unit_ix[rows, column]
     hidden = np.flatnonzero(status == HIDDEN)
     by = unit[hidden], frame[hidden], column[hidden]
     share, body = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
     share[hidden], body[hidden] = seen.share[by], seen.body_ix[by]
-    time_s = np.nan_to_num(np.where(status == KNOWN, made.age_s[rows, column], made.until_s[rows, column]))
+    time_s = np.nan_to_num(np.where(status >= EARLY, made.age_s[rows, column], made.until_s[rows, column]))
     near = seen.in_range[:, frame, column].any(axis=0)
     whole = [np.rint(value).astype(np.int64) for value in (time_s * 10, share * 100)]
-    keys, which = np.unique(np.stack([column, status, unit, *whole, body, near], axis=-1), axis=0, return_inverse=True)
+    columns = np.stack([column, status, unit, *whole, body, near, started], axis=-1)
+    keys, which = np.unique(columns, axis=0, return_inverse=True)
     ids, units = short_ids(scene), [*experiment.units, TRUTH]  # −1: the truth, or nobody
     told = [_sentence(ids, ids[seen.object_ix[key[0]]], units[key[2]], key) for key in keys.tolist()]
     return pa.array(told, pa.string()).take(pa.array(which.reshape(-1)))
 
 
 def _sentence(ids: tuple[str, ...], who: str, unit: str, key: list[int]) -> str:
-    _, status, _, tenths, hundredths, body, near = key
-    if status == KNOWN:
-        return f"{who} known" if tenths * 0.1 <= OLD_S else f"{who} known, {tenths / 10:.1f} s old"
+    _, status, _, tenths, hundredths, body, near, started = key
+    if status >= EARLY:
+        old = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
+        early = ", onset not known yet" if started else ""
+        after = {EARLY: f"{old}{early}", UNCONFIRMED: f"{old}, not confirmed yet", TOO_LATE: f" too late{old}"}
+        return f"{who} known{old}" if status == KNOWN else f"{who} listed{after[status]}"
     if status == CAPTURED:
         return f"{who} listed by {unit}, arrives in {tenths / 10:.1f} s"
     if status == UNMATCHED:
@@ -150,32 +167,36 @@ def listings(
     out.static(path, rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(0.5)))
 
 
-def lanes(out: Out, scene: Scene, seen: Sight, made: Mapping[str, Status], colours: Mapping[str, Rgb]) -> None:
-    """Of each shown object a lane per configuration: what it is to it, over time."""
+def lanes(
+    out: Out, scene: Scene, seen: Sight, made: Mapping[str, Status], colours: Mapping[str, Rgb], clock: Clock
+) -> None:
+    """Of each shown object a lane per configuration: what it is to it, over time; and one that marks the onset."""
     import rerun as rr
 
     if not made or not len(seen.object_ix):
         return
-    texts = [f"{name} {status}" for name in colours for status in STATUSES]
-    tints = [_tint(status, colours[name]) for name in colours for status in range(len(STATUSES))]
+    texts = [*(f"{name} {status}" for name in colours for status in STATUSES), *CLOCK]
+    tints = [*(_tint(status, colours[name]) for name in colours for status in range(len(STATUSES))), *CLOCK_TINTS]
     style = rr.StateConfiguration(values=texts, labels=texts, colors=tints)
     every = pa.array(texts, pa.string())
-    elapsed = np.unique(np.concatenate([of.elapsed_ns for of in made.values()]))
+    ended = clock.ended_ns[seen.object_ix] + 1
+    elapsed = np.unique(np.concatenate([ended, *(of.elapsed_ns for of in made.values())]))
     for m, k in enumerate(seen.object_ix.tolist()):
         columns = []
         for c, name in enumerate(colours):
             of = made[name]
             row = np.searchsorted(of.elapsed_ns, elapsed, side="right") - 1
             columns.append(np.where(row >= 0, of.status[np.maximum(row, 0), m], ABSENT) + c * len(STATUSES))
+        columns.append(np.searchsorted([clock.onset_ns[k], ended[m]], elapsed, "right") + len(colours) * len(STATUSES))
         state = np.stack(columns, axis=-1)
         told = np.flatnonzero(np.append(True, (state[1:] != state[:-1]).any(axis=1)))
         values = every.take(pa.array(state[told].reshape(-1)))
         path = ["lanes", object_labels(scene)[k].as_py()]
-        out.columns(path, elapsed[told], rr.StateChange.columns(state=values).partition([len(colours)] * len(told)))
+        out.columns(path, elapsed[told], rr.StateChange.columns(state=values).partition([len(columns)] * len(told)))
         out.static(path, style)
 
 
 def _tint(status: int, colour: Rgb) -> Rgb:
-    if status == KNOWN:
-        return colour
-    return (colour[0] // 2, colour[1] // 2, colour[2] // 2) if status == CAPTURED else LANES[status]
+    if status < EARLY:
+        return LANES[status]
+    return colour if status == KNOWN else (colour[0] // 2, colour[1] // 2, colour[2] // 2)

@@ -104,11 +104,19 @@ def position_errors(
         out.static(path, style)
 
 
-def known(out: Out, replay: Replay, name: str, tracks: Tracks, colour: Rgb | None = None) -> None:
-    """How many of all measured objects a configuration's newest list holds; without a colour: how many there are."""
+def known(
+    out: Out, replay: Replay, name: str, tracks: Tracks, colour: Rgb | None = None, since_ns: Int | None = None
+) -> None:
+    """How many of all measured objects a configuration's newest list holds; without a colour: how many there are.
+
+    `since_ns` (N + 1,): from when on each object counts, the last: no object.
+    """
     import rerun as rr
 
-    _, counts = by_frame(tracks, tracks.valid[0] & np.isin(tracks.row_object_ix, replay.looks.object_ix))
+    kept = tracks.valid[0] & np.isin(tracks.row_object_ix, replay.looks.object_ix)
+    if since_ns is not None:
+        kept &= elapsed_ns(tracks)[tracks.frame_ix] >= since_ns[tracks.row_object_ix]
+    _, counts = by_frame(tracks, kept)
     changes = np.flatnonzero(np.diff(counts, prepend=-1))  # a step lasts until the next
     rows = np.union1d(changes, [len(counts) - 1]) if len(counts) else changes
     path = ["plots", "known", name if colour is None else part_of(name)]

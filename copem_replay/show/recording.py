@@ -20,7 +20,7 @@ from copem_replay.show.eye import eye_on, follow
 from copem_replay.show.kept import Kept
 from copem_replay.show.out import Out, digest, part_of
 from copem_replay.show.sight import sight
-from copem_replay.show.status import status_of
+from copem_replay.show.status import clock_of, status_of
 from copem_replay.show.stream import Live, file_stream
 from copem_replay.tracks import TRUTH
 
@@ -79,9 +79,9 @@ def write_rrd(
             told, of_stretch = Kept(shown), chain(iter([first]), rest)
             del first  # one stretch's is held at a time
             for stretch in of_stretch:
-                _believed(out, replay, experiment, stretch, shown, colours)
+                _believed(out, replay, experiment, stretch, table[of_chosen], shown, colours)
                 told.add({name: stretch[name] for name in colours})
-            _knowledge(out, replay, experiment, told.whole(), shown, colours)
+            _knowledge(out, replay, experiment, told.whole(), table[of_chosen], shown, colours)
     finally:
         rr.set_strict_mode(strict)
         if live is not None:
@@ -127,24 +127,26 @@ def _world(
 
 
 def _knowledge(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], shown: Sequence[int],
-    colours: Mapping[str, Rgb],
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
+    shown: Sequence[int], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
     """Why, and since when. `beliefs`: of the shown objects, over all of the log."""
     seen = sight(replay, experiment, shown)
     made = {}
     for name, colour in colours.items():
-        made[name] = status_of(replay, experiment, name, beliefs[name], seen)
-        knowledge.words(out, name, replay, experiment, seen, made[name])
+        clock = clock_of(replay.scene, table, name)
+        made[name] = status_of(replay, experiment, name, beliefs[name], seen, clock)
+        knowledge.words(out, name, replay, experiment, seen, made[name], clock)
         knowledge.hiding(out, name, seen, made[name])
         asked = experiment.configurations[name]
         knowledge.listings(out, name, replay, experiment, asked, beliefs[name], seen, colour)
-    knowledge.lanes(out, replay.scene, seen, made, colours)
+    if shown:  # their onsets and ends are the same in all configurations
+        knowledge.lanes(out, replay.scene, seen, made, colours, clock)
 
 
 def _believed(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], shown: Sequence[int],
-    colours: Mapping[str, Rgb],
+    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
+    shown: Sequence[int], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
     """What each configuration knew in a stretch, and how far off that was."""
     for name, colour in colours.items():
@@ -152,7 +154,8 @@ def _believed(
         plots.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
         if len(replay.looks.object_ix):
             plots.gospas(out, replay, experiment, name, beliefs[name], colour)
-            plots.known(out, replay, name, beliefs[name].fused, colour)
+            since_ns = clock_of(replay.scene, table, name).known_ns
+            plots.known(out, replay, name, beliefs[name].fused, colour, since_ns)
 
 
 def _properties(

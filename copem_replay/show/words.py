@@ -143,8 +143,9 @@ LEGEND = """A configuration has one colour everywhere.
   where it listed somebody
 - red lines: from the unit that sees most of somebody to what hides them
 - strong lines on the ground: distance when somebody was first known
-- lanes: dark grey out of view, red hidden,
-  grey seen but not listed, dark colour listed and not arrived, colour known"""
+- lanes: dark grey out of view, red hidden, grey seen but not listed, bluish grey listed and not arrived; colour known,
+  at half its strength in the newest list and not known yet: captured before the onset, not confirmed, or too late;
+  pink, a lane for all: since the onset"""
 
 
 def summary(
