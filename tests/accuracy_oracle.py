@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.accuracy import BAND, EXISTENCE, OBJECT, RUN, Accuracy, Settings
-from copem_replay.fusion.object_list import Lists
-from copem_replay.match import DUPLICATE, GHOST, MATCH, Matches
-from copem_replay.onset import Looks, Reference
-from copem_replay.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
+from copem_replay.core.object_list import Lists
+from copem_replay.core.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
+from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Accuracy, Settings
+from copem_replay.metrics.episodes import Looks, Reference
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 
 Array = npt.NDArray[Any]
 SAME_S = 1e-6

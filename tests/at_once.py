@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from copem_replay.accuracy import Accuracy, Settings
-from copem_replay.assess import Assessment
-from copem_replay.detect import Detections
-from copem_replay.fusion.object_list import Lists
-from copem_replay.match import Matches
-from copem_replay.matched import Captures, FirstMatches, Steps
-from copem_replay.measure_keys import Confirm
-from copem_replay.onset import Looks, Reference
-from copem_replay.tracks import Bool, Float, Scene, Tracks
+from copem_replay.core.object_list import Lists
+from copem_replay.core.tracks import Bool, Float, Scene, Tracks
+from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.statistics import Accuracy, Settings
+from copem_replay.metrics.config import Confirm
+from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps
+from copem_replay.metrics.detection.by_truth_id import Detections
+from copem_replay.metrics.episodes import Looks, Reference
+from copem_replay.metrics.matching import Matches
 
 
 def assess(

@@ -14,7 +14,7 @@ import pyarrow as pa
 from pyarrow import parquet
 from scipy import stats
 
-from copem_replay.chance import Address, Dice, object_words
+from copem_replay.core.random import Address, Dice, object_words
 
 Row = dict[str, Any]
 

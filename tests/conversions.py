@@ -12,8 +12,8 @@ import pytest
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
 
-from copem_replay.read import Recording, read
-from copem_replay.tracks import CLASSES
+from copem_replay.core.tracks import CLASSES
+from copem_replay.io.recording import Recording, read
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))

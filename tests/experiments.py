@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from copem_replay.experiment_file import Source, load
+from copem_replay.experiment.file import Source, load
 from recordings import Obj, write_recording
 
 TEXT = """\

@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment, minimize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
-from copem_replay.tracks import CLASS_GROUPS, CLASSES
+from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
 from reports import reports_of
 
 Array = npt.NDArray[Any]

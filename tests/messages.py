@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from copem_replay.formats.cdr import CdrDefinition
-from copem_replay.formats.fields import Listed
-from copem_replay.formats.shred import Texts
-from copem_replay.tracks import CLASSES, VALUES
+from copem_replay.core.tracks import CLASSES, VALUES
+from copem_replay.io.encodings.cdr import CdrDefinition
+from copem_replay.io.encodings.columns import Texts
+from copem_replay.io.schemas.object_lists import Listed
 
 SEPARATOR = "=" * 80 + "\n"
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
 
-from copem_replay.check import problems, read_logs
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.results import write_results
-from copem_replay.run import run
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.pipeline.run import run
+from copem_replay.results.write import write_results
 from recordings import Obj, pedestrian, write_recording
 
 TEXT = """\

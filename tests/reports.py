@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
-from copem_replay.tracks import CLASSES
+from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.tracks import CLASSES
 
 Array = npt.NDArray[Any]
 SAME_S = 1e-6

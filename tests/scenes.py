@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.experiment import Experiment
-from copem_replay.read import Recording
-from copem_replay.tracks import CLASSES, TRUTH, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, TRUTH, Scene, Tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
 
 SIZES = {"car": (4.0, 2.0, 1.5), "pedestrian": (0.5, 0.5, 1.8), "truck": (8.0, 2.5, 3.5), "other": (1.0, 1.0, 4.0)}
 T0_NS = 1_700_000_000_000_000_000  # recordings have absolute stamps; floats of them would lose microseconds

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 
 from accuracy_oracle import Places, looks_of, one_run, permuted, plainly, reference_of, scene_of, truth_of
 from at_once import assess
-from copem_replay import accuracy_figures
-from copem_replay.accuracy import Accuracy, Settings, Total, for_runs, total
-from copem_replay.accuracy_figures import FIGURES
-from copem_replay.assess import Assessment
-from copem_replay.fusion.object_list import Entries, Lists
-from copem_replay.gospa import gospa, ospa
-from copem_replay.match import Matches, match
-from copem_replay.tracks import CLASSES
+from copem_replay.core.object_list import Entries, Lists
+from copem_replay.core.tracks import CLASSES
+from copem_replay.metrics.accuracy import metrics as accuracy_figures
+from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, total
+from copem_replay.metrics.gospa import gospa, ospa
+from copem_replay.metrics.matching import Matches, match
 from reports import between, entry, lists_of, stretches
 from reports import joined as one_list
 

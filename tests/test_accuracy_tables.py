@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import copem_replay.replay as replays
-from copem_replay.accuracy_tables import AccuracyTables
-from copem_replay.appraise import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
-from copem_replay.read import Recording
-from copem_replay.replay import believed, prepare
-from copem_replay.run import Result, run
+import copem_replay.pipeline.log_replay as replays
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.accuracy_tables import AccuracyTables
+from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.scoring import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 KEYS = ["log", "configuration", "run", "object_id"]

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from copem_replay.read import Recording
-from copem_replay.replay import believed, prepare
-from copem_replay.resample import states_at
-from copem_replay.run import run
+from copem_replay.core.interpolation import states_at
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.run import run
 from scenes import Thing, driving, experiment, recording
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.assignment import assign, assign_pairs, largest_around
+from copem_replay.core.assignment import assign, assign_pairs, largest_around
 from gnn_oracle import largest_around as largest_by_scipy
 
 Cost = npt.NDArray[np.float64]

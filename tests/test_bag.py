@@ -18,12 +18,12 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosWriter
 
-from copem_replay import container
-from copem_replay.bag import merged
-from copem_replay.cli import main
-from copem_replay.errors import RecordingError
-from copem_replay.info import describe, survey
-from copem_replay.read import Recording, read
+from copem_replay.cli.main import main
+from copem_replay.core.errors import RecordingError
+from copem_replay.experiment.draft.survey import describe, survey
+from copem_replay.io import log as container
+from copem_replay.io.containers.rosbag2 import merged
+from copem_replay.io.recording import Recording, read
 from experiments import changed
 from recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 from ros2 import STORE, odometry

@@ -10,16 +10,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import copem_replay.replay as replays
-from copem_replay import cli
-from copem_replay.believe import Believed, _without_truth, believe, listen, seen_by_all
-from copem_replay.experiment import Configuration, Experiment
-from copem_replay.fusion.component import ListFusion, fused_by
-from copem_replay.fusion.object_list import ENTRY, Lists
-from copem_replay.fusion.reports import reports
-from copem_replay.read import Recording
-from copem_replay.replay import prepare
-from copem_replay.run import Result, run
+import copem_replay.pipeline.log_replay as replays
+from copem_replay.cli import main as cli
+from copem_replay.core.object_list import ENTRY, Lists
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.fusion.base import ListFusion, fused_by
+from copem_replay.fusion.inputs import reports
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.receiver import Believed, _without_truth, believe, listen, seen_by_all
+from copem_replay.pipeline.run import Result, run
 from experiments import changed, drive
 from reports import reports_of
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -236,7 +236,7 @@ class TestInTheHead:
 
 OWN = """
 import numpy as np
-from copem_replay.fusion.component import StepFusion
+from copem_replay.fusion.base import StepFusion
 
 class Mine(StepFusion):
     wrong: str = ""

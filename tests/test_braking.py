@@ -23,8 +23,12 @@ from hypothesis import strategies as st
 from mpmath import mpf
 
 from braking_oracle import Motion, corners, outcome
-from copem_replay.braking.boxes import box_distance, nearest, pose_on, turning
-from copem_replay.braking.driver import (
+from copem_replay.core.box_distance import box_distance, nearest, pose_on, turning
+from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import Float
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.braking.driver import (
     ConstantDeceleration,
     ConstantReaction,
     Driver,
@@ -32,14 +36,10 @@ from copem_replay.braking.driver import (
     LognormalReaction,
     Reaction,
 )
-from copem_replay.braking.encounter import Encounter
-from copem_replay.braking.verdict import braked, fail_probability, judge, pass_probability, passing
-from copem_replay.errors import InputError
-from copem_replay.experiment import Experiment
-from copem_replay.read import Recording
-from copem_replay.replay import prepare, replay_block
-from copem_replay.run import run
-from copem_replay.tracks import Float
+from copem_replay.metrics.braking.encounter import Encounter
+from copem_replay.metrics.braking.verdict import braked, fail_probability, judge, pass_probability, passing
+from copem_replay.pipeline.log_replay import prepare, replay_block
+from copem_replay.pipeline.run import run
 from scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 
 SOME = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from copem_replay.formats.cdr import CdrDefinition
-from copem_replay.formats.raw_values import DefinitionError
-from copem_replay.formats.shred import Shredded, level_of, rows_above, take_apart
+from copem_replay.io.encodings.cdr import CdrDefinition
+from copem_replay.io.encodings.columns import Shredded, level_of, rows_above, take_apart
+from copem_replay.io.encodings.raw_values import DefinitionError
 from messages import SEPARATOR, defined, serialised, texts
 
 NUSCENES = Path(__file__).parents[2] / "shared/data/nuscenes_scene0916_autoware_ros2.mcap"
@@ -331,7 +331,7 @@ def test_batches_of_messages_are_one_table(monkeypatch: pytest.MonkeyPatch) -> N
     payloads = [serialised(text, m) for m in made]
     payloads.insert(7, b"\0\1\0\0")
     one = take_apart(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
-    monkeypatch.setattr("copem_replay.formats.shred.BATCH_BYTES", 60)
+    monkeypatch.setattr("copem_replay.io.encodings.columns.BATCH_BYTES", 60)
     many = take_apart(defined(text), payloads, ["b[].x"], ["n", "b[].s[]"])
     assert one.decoded.tolist() == many.decoded.tolist() == [k != 7 for k in range(21)]
     for name, level in one.levels.items():

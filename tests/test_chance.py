@@ -11,12 +11,12 @@ import pytest
 from scipy import stats
 from scipy.special import ndtri
 
-from copem_replay.accuracy_tables import with_accuracy
-from copem_replay.chance import Address, Dice, normal_quantile, object_words, philox4x32, stable_hash
-from copem_replay.read import Recording
-from copem_replay.replay import believed, blocks, outcomes, prepare
-from copem_replay.run import run
-from copem_replay.tracks import Tracks
+from copem_replay.core.random import Address, Dice, normal_quantile, object_words, philox4x32, stable_hash
+from copem_replay.core.tracks import Tracks
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.accuracy_tables import with_accuracy
+from copem_replay.pipeline.log_replay import believed, blocks, outcomes, prepare
+from copem_replay.pipeline.run import run
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 

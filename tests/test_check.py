@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.check import across_logs, log_names, problems, read_logs
-from copem_replay.experiment_file import log_paths
-from copem_replay.read import Recording
+from copem_replay.experiment.file import log_paths
+from copem_replay.experiment.validate import across_logs, log_names, problems, read_logs
+from copem_replay.io.recording import Recording
 from experiments import TEXT, changed, drive, source_of
 from recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 

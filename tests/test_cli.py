@@ -17,10 +17,14 @@ from typing import Any, NamedTuple
 import pandas as pd
 import pytest
 
-from copem_replay import cli, place, plain_yaml, results, run
-from copem_replay.compare import compare, comparison_markdown, comparison_text
-from copem_replay.experiment_file import load, parse
-from copem_replay.plot import load_results
+from copem_replay.cli import main as cli
+from copem_replay.core import yaml as plain_yaml
+from copem_replay.experiment.file import load, parse
+from copem_replay.pipeline import run
+from copem_replay.report.figures import load_results
+from copem_replay.results import place
+from copem_replay.results import write as results
+from copem_replay.results.compare import compare, comparison_markdown, comparison_text
 from experiments import TEXT, changed, drive
 from recordings import Obj, truth_topic, write_mcap, write_recording
 from viewer import free_port
@@ -181,7 +185,7 @@ class TestInstalled:
 
     def test_interrupt(self, here: Path) -> None:
         """Ctrl-C in the middle of a replay: nothing is left, not even a temporary folder."""
-        code = "import os, signal\nfrom copem_replay.pem.detection import DetectionModel\n\n\n"
+        code = "import os, signal\nfrom copem_replay.perception.pem.detection import DetectionModel\n\n\n"
         code += "class Pressed(DetectionModel):\n    def probability(self, look):\n"
         code += "        os.kill(os.getpid(), signal.SIGINT)\n        return look.visible_share\n"
         (here / "keys.py").write_text(code)
@@ -240,7 +244,7 @@ class TestInstalled:
             words = [sys.executable, "-c", close, stream, str(COMMAND), "run", "e.yaml", "--out", stream]
             assert subprocess.run(words, cwd=here, timeout=100).returncode == 0
 
-    @pytest.mark.parametrize("module", ["typer", "copem_replay.errors", "numpy", "pydantic", "ruamel.yaml"])
+    @pytest.mark.parametrize("module", ["typer", "copem_replay.core.errors", "numpy", "pydantic", "ruamel.yaml"])
     def test_an_interrupt_while_modules_are_imported(self, here: Path, module: str) -> None:
         """Whenever it comes: here as a module is looked for, before `main` is there to catch it and after."""
         (here / "sitecustomize.py").write_text(
@@ -381,7 +385,7 @@ class TestCheck:
     def test_runs_that_may_be_too_many_are_said_before(
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("copem_replay.memory.free_bytes", lambda: 50_000)
+        monkeypatch.setattr("copem_replay.pipeline.memory.free_bytes", lambda: 50_000)
         monkeypatch.setattr(run.replays, "outcomes", raising(OSError(5, "Input/output error")))
         said = "note: 4 runs of 3 rows each may take 6e-05 GB, and 5e-05 GB are free"
         assert call("check", "e.yaml").lines == [said]
@@ -1083,7 +1087,9 @@ class TestFailure:
                 signal.signal(number, handler)
 
     def test_a_defect_shows_where_it_is(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("copem_replay.info.survey", raising(ZeroDivisionError("division by zero")))
+        monkeypatch.setattr(
+            "copem_replay.experiment.draft.survey.survey", raising(ZeroDivisionError("division by zero"))
+        )
         ended = call("info", "drive.mcap")
         assert ended.code == 70
         assert ended.lines[0] == "Traceback (most recent call last):"

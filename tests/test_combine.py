@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 
-from copem_replay.fusion.combine import covariance_intersection, fast_covariance_intersection, inverse_variance
+from copem_replay.fusion.covariance import covariance_intersection, fast_covariance_intersection, inverse_variance
 
 Array = npt.NDArray[np.float64]
 Estimates = tuple[Array, Array]

@@ -12,8 +12,8 @@ import pytest
 from scipy.stats import binomtest
 
 from compare_folders import BRAKING, Row, limits_of, row, write_folder
-from copem_replay.compare import Comparison, compare
-from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
+from copem_replay.results.compare import Comparison, compare
 
 
 def compared(path: Path, rows: Sequence[Row], **given: Any) -> Comparison:

@@ -16,10 +16,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay import cli
-from copem_replay.compare.merge import Part, merged
-from copem_replay.experiment import Experiment
-from copem_replay.show.out import ELAPSED
+from copem_replay.cli import main as cli
+from copem_replay.experiment.schema import Experiment
+from copem_replay.viewer.merge_experiments import Part, merged
+from copem_replay.viewer.sink import ELAPSED
 from experiments import changed, drive
 from recordings import Obj, pedestrian, write_recording
 from test_show import at, rows, static

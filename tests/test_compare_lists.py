@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from compare_folders import Row, ghosts, limits_of, row, seen, step, write_folder
-from copem_replay.compare import Comparison, compare
-from copem_replay.compare import lists as lists_module
+from copem_replay.results.compare import Comparison, compare
+from copem_replay.results.compare import per_list as lists_module
 
 FOUR = [None] * 4
 

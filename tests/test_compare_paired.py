@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from compare_folders import widened
-from copem_replay.intervals import Resamples, multiplicities, percentile_limits
-from copem_replay.paired import mcnemar, resampled_medians, resampled_sums
-from copem_replay.statistics import quantile_with_never
+from copem_replay.metrics.intervals import Resamples, multiplicities, percentile_limits
+from copem_replay.metrics.survival import quantile_with_never
+from copem_replay.results.compare.paired_statistics import mcnemar, resampled_medians, resampled_sums
 
 counts = st.integers(0, 400)
 

@@ -11,8 +11,8 @@ import pytest
 from pyarrow import parquet
 
 from compare_folders import BRAKING, MEASURE, Row, ghosts, row, seen, write_folder
-from copem_replay.compare import compare
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
+from copem_replay.results.compare import compare
 
 ROWS = [row("ideal", 1.0, 30.0), row("late", 2.0, 20.0)]
 VERDICTS = [r | {"conflict": True, "braking_pass": True} for r in ROWS]

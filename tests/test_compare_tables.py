@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
 from compare_folders import Row, row, write_folder
-from copem_replay.compare import (
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.results.compare import (
     Comparison,
     check_out,
     compare,
@@ -21,8 +22,7 @@ from copem_replay.compare import (
     comparison_text,
     write_comparison,
 )
-from copem_replay.compare.tables import in_markdown
-from copem_replay.errors import InputError, OutputError
+from copem_replay.results.compare.tables import in_markdown
 
 
 def rows(*names: str) -> list[Row]:

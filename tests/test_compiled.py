@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay import compiled
+from copem_replay.core import compiled
 from experiments import TEXT, drive
 from test_cli import Call, call, raising
 
@@ -42,7 +42,7 @@ def run(sealed: Path, tmp_path: Path) -> Run:
 
     def ran(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, "-B", "-m", "copem_replay.cli", *arguments],
+            [sys.executable, "-B", "-m", "copem_replay.cli.main", *arguments],
             cwd=tmp_path, env=clean | nowhere | environment, capture_output=True, text=True, timeout=100,
         )  # fmt: skip
 
@@ -106,7 +106,7 @@ def test_the_users_cache_is_taken_as_ever(run: Run, tmp_path: Path) -> None:
 
 
 def test_not_even_a_temporary_folder(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    error = RuntimeError("cannot cache function 'assign': no locator available for file 'assignment.py'")
-    monkeypatch.setattr("copem_replay.info.survey", raising(error))
+    error = RuntimeError("cannot cache function 'assign': no locator available for file 'core/assignment.py'")
+    monkeypatch.setattr("copem_replay.experiment.draft.survey.survey", raising(error))
     line = "copem-replay: no folder to cache compiled code in; set NUMBA_CACHE_DIR to one that can be written"
     assert call("info", "drive.mcap") == (2, "", [line])

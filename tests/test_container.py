@@ -7,9 +7,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
-from copem_replay import container
-from copem_replay.errors import RecordingError
-from copem_replay.read import Recording, read
+from copem_replay.core.errors import RecordingError
+from copem_replay.io import log as container
+from copem_replay.io.recording import Recording, read
 from recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 
 # Ten frames 0.1 s apart; with `chunk_size=1` every message has a chunk of its own.

@@ -12,7 +12,7 @@ import pytest
 from osi3.osi_object_pb2 import MovingObject
 
 from conversions import ROOT, Runner, convert, run
-from copem_replay.info import survey
+from copem_replay.experiment.draft.survey import survey
 
 __all__ = ["run"]
 
@@ -39,7 +39,7 @@ def test_it_runs_as_a_command(tmp_path: Path) -> None:
     source.write_text(f"{HEADER}\n{CAR}\n")
     done = subprocess.run([*tool, "csv", source, tmp_path / "a.mcap"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith(f"{tmp_path / 'a.mcap'}: 1 frame, 1 car\nnote: 1 row without height_m")
-    main = "from copem_replay.cli import main; main()"
+    main = "from copem_replay.cli.main import main; main()"
     shown = subprocess.run(
         [sys.executable, "-c", main, "info", tmp_path / "a.mcap"], capture_output=True, text=True, check=True
     )
@@ -463,8 +463,8 @@ def test_commonroad_refuses(run: Runner, text: str, line: str) -> None:
 
 def test_every_kind_is_of_the_class_its_name_says() -> None:
     from converters.kinds import KINDS
-    from copem_replay.formats.osi import class_of
-    from copem_replay.tracks import CLASSES
+    from copem_replay.core.tracks import CLASSES
+    from copem_replay.io.schemas.osi_ground_truth import class_of
 
     found = {name: CLASSES[class_of(kind.type, kind.vehicle)] for name, kind in KINDS.items() if kind.moving}
     others = {

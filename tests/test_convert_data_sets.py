@@ -17,8 +17,8 @@ from osi3.osi_object_pb2 import StationaryObject
 
 from conversions import Runner, convert, run
 from converters import restricted_pickle
-from copem_replay.errors import InputError
-from copem_replay.read import read
+from copem_replay.core.errors import InputError
+from copem_replay.io.recording import read
 
 __all__ = ["run"]
 

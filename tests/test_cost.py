@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from copem_replay import cli
-from copem_replay.cost import Cost
-from copem_replay.replay import outcomes, prepare
+from copem_replay.cli import main as cli
+from copem_replay.pipeline.cost import Cost
+from copem_replay.pipeline.log_replay import outcomes, prepare
 from experiments import changed, drive
 from scenes import experiment, oncoming_car
 
@@ -61,8 +61,8 @@ def test_the_terminal_alone_says_it(
         return capsys.readouterr().err
 
     assert NOTE not in said("quick")
-    monkeypatch.setattr("copem_replay.cost.LONG_S", 0.0)
-    monkeypatch.setattr("copem_replay.cost.MOSTLY", 0.0)
+    monkeypatch.setattr("copem_replay.pipeline.cost.LONG_S", 0.0)
+    monkeypatch.setattr("copem_replay.pipeline.cost.MOSTLY", 0.0)
     [line] = [line for line in said("slow").splitlines() if NOTE in line]
     assert line.startswith("note: accuracy took ")
     assert line.endswith("; `measure: {accuracy: false}` leaves it out")

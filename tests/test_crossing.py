@@ -22,9 +22,9 @@ from osi3.osi_object_pb2 import MovingObject
 from ruamel.yaml import YAML
 from shapely import LineString, Polygon, affinity
 
-from copem_replay.check import across_logs, problems, read_logs
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.run import run
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.validate import across_logs, problems, read_logs
+from copem_replay.pipeline.run import run
 
 ROOT = Path(__file__).resolve().parents[1]
 LOG = ROOT / "logs" / "crossing.mcap"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.csv_names import as_named, for_spreadsheets
+from copem_replay.core.csv_names import as_named, for_spreadsheets
 
 BEGINNINGS = st.sampled_from(["", "=", "+", "-", "@", "\t", "\r", "\n", "'", "''", "'="])
 

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.detect import capture_instants, detect
+from copem_replay.core.tracks import VALUES, Tracks
 from copem_replay.fusion.ideal import fuse
-from copem_replay.measure_keys import Confirm
-from copem_replay.onset import Looks
-from copem_replay.tracks import VALUES, Tracks
+from copem_replay.metrics.config import Confirm
+from copem_replay.metrics.detection.by_truth_id import capture_instants, detect
+from copem_replay.metrics.episodes import Looks
 
 NEVER = None
 Held = frozenset[tuple[int, int]]

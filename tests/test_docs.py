@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 import scenes
-from copem_replay import cli
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, parse
-from copem_replay.fusion.component import StepFusion
-from copem_replay.pem.detection import DetectionModel
-from copem_replay.pem.look import Look
-from copem_replay.replay import believed, prepare
-from copem_replay.run import Result
-from copem_replay.testing import check_fusion
+from copem_replay.cli import main as cli
+from copem_replay.core.view_geometry import Look
+from copem_replay.experiment.file import load, parse
+from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.base import StepFusion
+from copem_replay.fusion.testing.check import check_fusion
+from copem_replay.perception.pem.detection import DetectionModel
+from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.run import Result
 from scenes import experiment
 
 ROOT = Path(__file__).parents[1]

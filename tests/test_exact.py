@@ -26,21 +26,21 @@ from hypothesis import strategies as st
 from mpmath import mp, mpf
 from pyarrow import parquet
 
-from copem_replay import cli
-from copem_replay.braking.driver import Reaction
-from copem_replay.braking.verdict import judge
-from copem_replay.check import problems, read_logs
-from copem_replay.detect import detect
-from copem_replay.errors import ExperimentError
-from copem_replay.exact import distributions, exact_table
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.read import Recording
-from copem_replay.replay import Replay, listen, prepare
-from copem_replay.run import Result, run
-from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
-from copem_replay.summary import summary
-from copem_replay.tracks import Float
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.tracks import Float
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.braking.driver import Reaction
+from copem_replay.metrics.braking.verdict import judge
+from copem_replay.metrics.detection.by_truth_id import detect
+from copem_replay.metrics.summary import summary
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
+from copem_replay.pipeline.closed_form import distributions, exact_table
+from copem_replay.pipeline.log_replay import Replay, listen, prepare
+from copem_replay.pipeline.run import Result, run
 from experiments import changed, drive, source_of
 from scenes import Thing, driving, experiment, recording, standing
 

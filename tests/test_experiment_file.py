@@ -11,18 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay import components, plain_yaml
-from copem_replay.components import Component
-from copem_replay.errors import ExperimentError
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, log_paths, parse
-from copem_replay.fusion.component import Ideal, Inbox, StepFusion
-from copem_replay.fusion.object_list import Entries
+from copem_replay.core import components
+from copem_replay.core import yaml as plain_yaml
+from copem_replay.core.components import Component
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import Float
+from copem_replay.core.view_geometry import Look
+from copem_replay.experiment.file import load, log_paths, parse
+from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.base import Ideal, Inbox, StepFusion
 from copem_replay.fusion.tracker import Tracker
-from copem_replay.pem.detection import Constant, DetectionModel, VisibleShare
-from copem_replay.pem.error import ErrorModel
-from copem_replay.pem.look import Look
-from copem_replay.tracks import Float
+from copem_replay.perception.pem.detection import Constant, DetectionModel, VisibleShare
+from copem_replay.perception.pem.error import ErrorModel
 from experiments import TEXT, changed, source_of
 
 CONTRACT = """\
@@ -681,10 +682,16 @@ class TestComponents:
         [
             ("nomodule:X", "cannot be imported: ModuleNotFoundError: No module named 'nomodule'"),
             ("os:nothing", "cannot be imported: AttributeError: module 'os' has no attribute 'nothing'"),
-            ("os:path", "is no kind of copem_replay.pem.detection.DetectionModel"),
-            (f"{__name__}:NoModel", "is no kind of copem_replay.pem.detection.DetectionModel"),
-            ("copem_replay.pem.error:Gaussian", "is no kind of copem_replay.pem.detection.DetectionModel"),
-            ("copem_replay.pem.detection:DetectionModel", "is no kind of copem_replay.pem.detection.DetectionModel"),
+            ("os:path", "is no kind of copem_replay.perception.pem.detection.DetectionModel"),
+            (f"{__name__}:NoModel", "is no kind of copem_replay.perception.pem.detection.DetectionModel"),
+            (
+                "copem_replay.perception.pem.error:Gaussian",
+                "is no kind of copem_replay.perception.pem.detection.DetectionModel",
+            ),
+            (
+                "copem_replay.perception.pem.detection:DetectionModel",
+                "is no kind of copem_replay.perception.pem.detection.DetectionModel",
+            ),
             ("..relative:X", "cannot be imported: TypeError: "),
             (":", "cannot be imported: ValueError: Empty module name"),
             ("broken_module_of_a_user:X", "cannot be imported: SyntaxError: "),
@@ -700,7 +707,9 @@ class TestComponents:
         assert "\n" not in problem
 
     def test_error_slot_takes_error_models_only(self, tmp_path: Path) -> None:
-        (problem,) = problems(tmp_path, changed(at(ERROR, "kind: 'copem_replay.pem.detection:VisibleShare'")))
+        (problem,) = problems(
+            tmp_path, changed(at(ERROR, "kind: 'copem_replay.perception.pem.detection:VisibleShare'"))
+        )
         assert f"is no kind of {ErrorModel.__module__}.ErrorModel" in problem
 
     def test_fusion(self, tmp_path: Path) -> None:
@@ -715,7 +724,7 @@ class TestComponents:
         ):
             assert experiment(tmp_path, changed(at(COPEM, text))).configurations["coPEM"].fusion == expected
         (problem,) = problems(tmp_path, changed(at(COPEM, f"fusion: {{kind: '{__name__}:Always'}}")))
-        assert "is no kind of copem_replay.fusion.component.Fusion" in problem
+        assert "is no kind of copem_replay.fusion.base.Fusion" in problem
 
     def test_the_schema_asks_for_the_kind_of_all_but_ideal_fusion(self) -> None:
         fusion = Experiment.model_json_schema()["$defs"]["Configuration"]["properties"]["fusion"]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from copem_replay.formats.fields import Class, Description, Fields, FieldsError, Listed, Stamp, Yaw, listed
-from copem_replay.formats.json_messages import JsonDefinition
-from copem_replay.tracks import CLASSES, VALUES
+from copem_replay.core.tracks import CLASSES, VALUES
+from copem_replay.io.encodings.json import JsonDefinition
+from copem_replay.io.schemas.object_lists import Class, Description, Fields, FieldsError, Listed, Stamp, Yaw, listed
 from messages import SEPARATOR, classes, defined, ids, quaternion, serialised, values
 from test_shred import OBJECTS, in_protobuf
 

@@ -8,12 +8,12 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from copem_replay.compare import compare, comparison_text
-from copem_replay.fixed import fixed_in
-from copem_replay.plot import curves_figure, load_results
-from copem_replay.report.page import page
-from copem_replay.report.study import load_study
-from copem_replay.table import summary_text
+from copem_replay.metrics.fixed import fixed_in
+from copem_replay.metrics.summary_text import summary_text
+from copem_replay.report.figures import curves_figure, load_results
+from copem_replay.report.html.page import page
+from copem_replay.report.html.study import load_study
+from copem_replay.results.compare import compare, comparison_text
 from report_pages import ONE, Page, changed, replayed
 
 DRAWN_REACTION = ("{kind: constant, delay_s: 0.2}", "{kind: gamma, shape: 4.0, mean_s: 0.2}")

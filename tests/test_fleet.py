@@ -21,17 +21,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from copem_replay import cli
-from copem_replay.accuracy_tables import with_accuracy
-from copem_replay.check import against_log, problems
-from copem_replay.errors import ExperimentError
-from copem_replay.exact import distributions, exact_table
-from copem_replay.experiment import Carriers, Experiment
-from copem_replay.fleet import Fleet, fleet_of, of_run
-from copem_replay.read import Recording
-from copem_replay.replay import Replay, list_rates, outcomes, prepare
-from copem_replay.run import run
-from copem_replay.tracks import Bool, Int
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.tracks import Bool, Int
+from copem_replay.experiment.schema import Carriers, Experiment
+from copem_replay.experiment.validate import against_log, problems
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.accuracy_tables import with_accuracy
+from copem_replay.pipeline.closed_form import distributions, exact_table
+from copem_replay.pipeline.expansion import Fleet, fleet_of, of_run
+from copem_replay.pipeline.log_replay import Replay, list_rates, outcomes, prepare
+from copem_replay.pipeline.run import run
 from experiments import changed, source_of
 from recordings import Obj, pedestrian, write_recording
 from scenes import Thing, driving, experiment, recording, standing

@@ -24,17 +24,17 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 import scenes
-from copem_replay import cli
-from copem_replay.braking.encounter import EgoCourse
-from copem_replay.check import problems
-from copem_replay.experiment import Experiment
-from copem_replay.foresee import _will_be_in, corridors
-from copem_replay.fusion.belief import Belief
-from copem_replay.measure_keys import Conflict
-from copem_replay.read import Recording
-from copem_replay.replay import believed, prepare, replay_block
-from copem_replay.run import run
-from copem_replay.tracks import Float
+from copem_replay.cli import main as cli
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import Float
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.braking.encounter import EgoCourse
+from copem_replay.metrics.config import Conflict
+from copem_replay.metrics.detection.conflict import _will_be_in, corridors
+from copem_replay.pipeline.log_replay import believed, prepare, replay_block
+from copem_replay.pipeline.run import run
 from experiments import changed, source_of
 from recordings import Obj, pedestrian, write_recording
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from copem_replay.check import problems, read_logs
-from copem_replay.errors import InputError
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.results import write_results
-from copem_replay.run import run
+from copem_replay.core.errors import InputError
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.pipeline.run import run
+from copem_replay.results.write import write_results
 from test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[1]

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.formats.poses import Poses
-from copem_replay.frames import Frames, Placed, course_of
-from copem_replay.rotation import yaw_of
+from copem_replay.core.rotation import yaw_of
+from copem_replay.io.schemas.poses import Poses
+from copem_replay.io.transforms import Frames, Placed, course_of
 
 Sample = tuple[float, float, float, float]
 """Seconds, x, y, yaw in degrees."""

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 import gnn_oracle
+from copem_replay.core.object_list import ENTRY, Entries, Lists, Reports, entries_of
+from copem_replay.core.tracks import CLASSES
 from copem_replay.fusion.content_order import sort_rows
 from copem_replay.fusion.gnn import Gnn
-from copem_replay.fusion.object_list import ENTRY, Entries, Lists, Reports, entries_of
-from copem_replay.tracks import CLASSES
 from gnn_oracle import in_any_order, random_reports
 from reports import entry, joined, reports_of
 

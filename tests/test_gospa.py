@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.gospa import gospa, gospa_pairs, ospa
+from copem_replay.metrics.gospa import gospa, gospa_pairs, ospa
 
 Points = npt.NDArray[np.float64]
 

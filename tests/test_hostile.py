@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.chunks import CHUNK_LIMIT_BYTES
-from copem_replay.errors import CopemError, RecordingError
-from copem_replay.info import survey
-from copem_replay.read import read
+from copem_replay.core.errors import CopemError, RecordingError
+from copem_replay.experiment.draft.survey import survey
+from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES
+from copem_replay.io.recording import read
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))

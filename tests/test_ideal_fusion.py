@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from copem_replay.candidates import candidates
-from copem_replay.experiment import Experiment
+from copem_replay.communication.arrivals import instants
+from copem_replay.communication.link import transmit
+from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Tracks
+from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.ideal import draw_posterior, fuse
-from copem_replay.fusion.instants import instants
-from copem_replay.perceive import perceive
-from copem_replay.read import Recording
-from copem_replay.tracks import UNCERTAINTIES, VALUES, Tracks
-from copem_replay.transmit import transmit
+from copem_replay.io.recording import Recording
+from copem_replay.perception.observation import candidates
+from copem_replay.perception.perceive import perceive
 from scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 Array = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.info import describe, survey
+from copem_replay.experiment.draft.survey import describe, survey
 from recordings import SHARED, Obj, Topic, pedestrian, truth_topic, write_mcap, write_recording
 
 # A car at 10 m/s for 1.5 s, a pedestrian who is there at 0, 0.25 and 1.5 s, a cone; no list at 1 s.
@@ -272,7 +272,7 @@ def test_survey_is_quick_and_light(path):
     frames = [(k / 10, [Obj(id=i, x=i * 9 + k, vx=10) for i in range(30)]) for k in range(300)]
     write_recording(path, frames, host=0)
     code = (
-        "import sys; from copem_replay.info import describe, survey; describe(survey(sys.argv[1]));"
+        "import sys; from copem_replay.experiment.draft.survey import describe, survey; describe(survey(sys.argv[1]));"
         "print([m for m in ('pandas', 'numba', 'scipy', 'pydantic', 'shapely', 'rerun') if m in sys.modules])"
     )
     began = time.perf_counter()

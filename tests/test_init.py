@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from osi3.osi_sensordata_pb2 import SensorData
 
-from copem_replay import cli, plain_yaml
-from copem_replay.info import survey
-from copem_replay.init import commented, quoted, short
+from copem_replay.cli import main as cli
+from copem_replay.core import yaml as plain_yaml
+from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.template import commented, quoted, short
 from experiments import drive
 from recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from compare_folders import limits_of, widened
-from copem_replay.intervals import (
+from copem_replay.metrics.intervals import (
     Resamples,
     alike_limits,
     bootstrap_share,

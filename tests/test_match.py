@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from accuracy_oracle import likely, one_run, permuted, scene_of, truth_of
-from copem_replay.fusion.agree import AGREE
-from copem_replay.fusion.object_list import Entries
-from copem_replay.match import DUPLICATE, GHOST, MATCH, Matches, match
-from copem_replay.tracks import CLASSES
+from copem_replay.core.agree import AGREE
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import CLASSES
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches, match
 from reports import entry, joined, lists_of
 
 Found = list[tuple[int, int]]

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from accuracy_oracle import looks_of, one_run, permuted
 from at_once import first_matches
-from copem_replay.fusion.object_list import Lists
-from copem_replay.match import DUPLICATE, GHOST, MATCH, Matches
-from copem_replay.matched import Captures, FirstMatches, Steps, captures_of
-from copem_replay.measure_keys import Confirm
+from copem_replay.core.object_list import Lists
+from copem_replay.metrics.config import Confirm
+from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps, captures_of
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 from reports import between, entry, joined, lists_of, stretches
 from test_detect import Unit, World, holds, tracks
 

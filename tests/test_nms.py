@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from copem_replay.core.object_list import Entries, Reports, entries_of
+from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.object_list import Entries, Reports, entries_of
-from copem_replay.tracks import CLASS_GROUPS, CLASSES
 from gnn_oracle import in_any_order, random_reports
 from reports import entry, joined, reports_of
 

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from copem_replay import memory
-from copem_replay.check import problems, read_logs
-from copem_replay.errors import ExperimentError
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import log_paths
-from copem_replay.read import Recording
-from copem_replay.replay import Replay, prepare
-from copem_replay.run import notes_of, run
+from copem_replay.core.errors import ExperimentError
+from copem_replay.experiment.file import log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline import memory
+from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.pipeline.run import notes_of, run
 from experiments import TEXT, changed, drive, source_of
 from recordings import Obj, write_recording
 

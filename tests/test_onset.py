@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import scenes
-from copem_replay.experiment import Experiment
-from copem_replay.measure import distances
-from copem_replay.onset import ENDED_BY, looks
-from copem_replay.read import Recording
-from copem_replay.visibility import NO_STATICS
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.detections_table import distances
+from copem_replay.metrics.episodes import ENDED_BY, looks
+from copem_replay.perception.visibility import NO_STATICS
 from scenes import Thing, driving, experiment, recording, standing
 
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import scenes
-from copem_replay.errors import InputError
-from copem_replay.fusion.component import Inbox, StepFusion
-from copem_replay.pem.detection import DetectionModel
-from copem_replay.pem.error import ErrorModel
-from copem_replay.pem.look import Errors, Look, Noise
-from copem_replay.replay import believed, prepare
-from copem_replay.stretches import WHOLE
+from copem_replay.core.errors import InputError
+from copem_replay.core.view_geometry import Errors, Look, Noise
+from copem_replay.fusion.base import Inbox, StepFusion
+from copem_replay.perception.pem.detection import DetectionModel
+from copem_replay.perception.pem.error import ErrorModel
+from copem_replay.pipeline.chunking import WHOLE
+from copem_replay.pipeline.log_replay import believed, prepare
 from scenes import experiment
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from copem_replay.check import problems, read_logs
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.read import Recording
-from copem_replay.replay import prepare
-from copem_replay.run import run
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.run import run
 
 FILE = Path(__file__).parents[1] / "logs/tc016d.yaml"
 ONSET_S = 3.0

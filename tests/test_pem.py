@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy import stats
 
-from copem_replay.chance import Address, Dice, object_words
-from copem_replay.pem.condition import Condition, Couple, applies
-from copem_replay.pem.detection import DetectionModel
-from copem_replay.pem.error import ErrorModel, Gaussian
-from copem_replay.pem.look import Errors, Look, Noise
-from copem_replay.tracks import CLASSES
+from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.tracks import CLASSES
+from copem_replay.core.view_geometry import Errors, Look, Noise
+from copem_replay.perception.pem.condition import Condition, Couple, applies
+from copem_replay.perception.pem.detection import DetectionModel
+from copem_replay.perception.pem.error import ErrorModel, Gaussian
 
 Array = npt.NDArray[np.float64]
 

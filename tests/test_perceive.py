@@ -12,11 +12,11 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from copem_replay.candidates import Candidates, candidates
-from copem_replay.experiment import Experiment
-from copem_replay.perceive import perceive
-from copem_replay.read import Recording
-from copem_replay.tracks import VALUES, Tracks
+from copem_replay.core.tracks import VALUES, Tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.perception.observation import Candidates, candidates
+from copem_replay.perception.perceive import perceive
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 RUNS = np.arange(20_000)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from copem_replay.colours import configuration_colours
+from copem_replay.core.colours import configuration_colours
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tools"))

@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 
-from copem_replay import belongings, lock, place, scratch
-from copem_replay import run as runs
-from copem_replay.atomic import atomic_file
-from copem_replay.errors import OutputError
+from copem_replay.core import scratch
+from copem_replay.core.errors import OutputError
+from copem_replay.core.files import atomic_file
+from copem_replay.pipeline import run as runs
+from copem_replay.results import belongings, lock, place
 from experiments import TEXT, changed, drive
 from test_cli import ROOT, Call, Ended, call, here, installed, written
 
@@ -415,8 +416,8 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
     old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     """Results that are replaced while figures are drawn, or a page is made."""
-    from copem_replay.plot import write as figures
-    from copem_replay.report import page
+    from copem_replay.report.figures import write as figures
+    from copem_replay.report.html import page
 
     def meanwhile(original: Callable[..., Any]) -> Callable[..., Any]:
         def replaced(*a: Any, **k: Any) -> Any:
@@ -436,7 +437,7 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
 def test_tables_of_old_and_new_results_are_not_read_as_one(
     old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from copem_replay.compare import folders
+    from copem_replay.results import folders
 
     experiment = folders._experiment
     replaced = iter([True])

@@ -24,12 +24,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from copem_replay import cli
-from copem_replay.check import problems, read_logs
-from copem_replay.errors import InputError
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.intervals import resamples, share_limits
-from copem_replay.plot import (
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import InputError
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.metrics.intervals import resamples, share_limits
+from copem_replay.metrics.summary import clusters
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
+from copem_replay.pipeline.run import run
+from copem_replay.report.figures import (
     Results,
     curves_figure,
     distances_figure,
@@ -38,17 +41,14 @@ from copem_replay.plot import (
     sweeps_figure,
     write_figures,
 )
-from copem_replay.plot.appearance import appearances
-from copem_replay.plot.bands import band, resampled_incidence
-from copem_replay.plot.captions import percent, short_names
-from copem_replay.plot.choice import choose
-from copem_replay.plot.distances import FAIL, NEUTRAL, PASS, spread
-from copem_replay.plot.staircase import last_instant
-from copem_replay.plot.story import Event
-from copem_replay.results import write_results
-from copem_replay.run import run
-from copem_replay.statistics import CENSORED, DETECTED, LEFT, cumulative_incidence
-from copem_replay.summary import clusters
+from copem_replay.report.figures.bands import band, resampled_incidence
+from copem_replay.report.figures.captions import percent, short_names
+from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, spread
+from copem_replay.report.figures.label_layout import last_instant
+from copem_replay.report.figures.selection import choose
+from copem_replay.report.figures.style import appearances
+from copem_replay.report.figures.timeline import Event
+from copem_replay.results.write import write_results
 from recordings import Obj, pedestrian, write_recording
 
 TEXT = """\
@@ -317,7 +317,7 @@ class TestCommand:
         assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
     def test_matplotlib_is_imported_where_it_is_used(self) -> None:
-        code = "import sys, copem_replay.cli, copem_replay.plot; sys.exit('matplotlib' in sys.modules)"
+        code = "import sys, copem_replay.cli.main, copem_replay.report.figures; sys.exit('matplotlib' in sys.modules)"
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

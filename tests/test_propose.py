@@ -12,9 +12,9 @@ import pytest
 from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 
-from copem_replay import plain_yaml
-from copem_replay.formats.propose import propose
-from copem_replay.info import survey
+from copem_replay.core import yaml as plain_yaml
+from copem_replay.experiment.draft.field_guess import propose
+from copem_replay.experiment.draft.survey import survey
 from messages import SEPARATOR, serialised
 from test_init import Call, call, replayed  # noqa: F401
 from test_shred import in_protobuf, schema

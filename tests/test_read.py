@@ -10,9 +10,9 @@ from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_sensorview_pb2 import SensorView
 
-from copem_replay.errors import RecordingError
-from copem_replay.read import Recording, read
-from copem_replay.tracks import CLASSES, TRUTH, VALUES
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.tracks import CLASSES, TRUTH, VALUES
+from copem_replay.io.recording import Recording, read
 from recordings import (
     ANIMAL,
     PEDESTRIAN,

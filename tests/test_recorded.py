@@ -12,16 +12,16 @@ import pytest
 from osi3.osi_detectedobject_pb2 import DetectedMovingObject
 from osi3.osi_sensordata_pb2 import SensorData
 
-from copem_replay import cli
-from copem_replay.believe import Believed, believe
-from copem_replay.check import read_logs
-from copem_replay.experiment import Experiment
-from copem_replay.plain_yaml import dump
-from copem_replay.read import Recording
-from copem_replay.replay import prepare
-from copem_replay.resample import states_at
-from copem_replay.run import Result, run
-from copem_replay.tracks import CLASSES
+from copem_replay.cli import main as cli
+from copem_replay.core.interpolation import states_at
+from copem_replay.core.tracks import CLASSES
+from copem_replay.core.yaml import dump
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import read_logs
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.receiver import Believed, believe
+from copem_replay.pipeline.run import Result, run
 from recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording
 
 

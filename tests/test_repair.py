@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.repair import HEIGHTS_M, heights, velocities
-from copem_replay.tracks import CLASSES
+from copem_replay.core.tracks import CLASSES
+from copem_replay.io.plausibility import HEIGHTS_M, heights, velocities
 
 NAN = float("nan")
 

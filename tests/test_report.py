@@ -17,19 +17,27 @@ import pandas as pd
 import plotly.graph_objects as go
 import pytest
 
-from copem_replay import cli
-from copem_replay.compare import compare, comparison_text
-from copem_replay.errors import InputError, OutputError
-from copem_replay.plot import load_results
-from copem_replay.plot.appearance import appearances
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.metrics.summary_text import summary_text
 from copem_replay.report import write_report
-from copem_replay.report.drawing import rgb
-from copem_replay.report.markup import Html, tag
-from copem_replay.report.never import misses, powers
-from copem_replay.report.page import page
-from copem_replay.report.study import load_study
-from copem_replay.report.waterfall import FUSION, HIDDEN, IN_SIGHT, SINCE_CAPTURED, TRANSPORT, UNTIL_CAPTURED, stages
-from copem_replay.table import summary_text
+from copem_replay.report.figures import load_results
+from copem_replay.report.figures.style import appearances
+from copem_replay.report.html.latency_breakdown import (
+    FUSION,
+    HIDDEN,
+    IN_SIGHT,
+    SINCE_CAPTURED,
+    TRANSPORT,
+    UNTIL_CAPTURED,
+    stages,
+)
+from copem_replay.report.html.markup import Html, tag
+from copem_replay.report.html.missed_objects import misses, powers
+from copem_replay.report.html.page import page
+from copem_replay.report.html.plotly_figures import rgb
+from copem_replay.report.html.study import load_study
+from copem_replay.results.compare import compare, comparison_text
 from report_pages import ALONE, EVERY, ONE, Page, changed, drive, replayed
 
 NAMES = ("GT", "late", "half", "hit", "never")

@@ -11,17 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.believe import World, _without_truth, believe, seen_by_all
-from copem_replay.experiment import Experiment
-from copem_replay.fusion.as_lists import as_belief
-from copem_replay.fusion.component import inbox_at
-from copem_replay.fusion.instants import Instants, instants, outrun
-from copem_replay.fusion.object_list import ENTRY, Entries, Lists, entries_of
-from copem_replay.fusion.reports import reports
-from copem_replay.match import DUPLICATE, GHOST, MATCH, match
-from copem_replay.read import Recording
-from copem_replay.replay import prepare
-from copem_replay.tracks import CLASSES, VALUES, Tracks
+from copem_replay.communication.arrivals import Instants, instants, outrun
+from copem_replay.core.object_list import ENTRY, Entries, Lists, entries_of
+from copem_replay.core.tracks import CLASSES, VALUES, Tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.base import inbox_at
+from copem_replay.fusion.inputs import reports
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match
+from copem_replay.pipeline.conversions import as_belief
+from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.receiver import World, _without_truth, believe, seen_by_all
 from reports import lists_of, reports_of
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 

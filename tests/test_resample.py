@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.resample import at_instants, states_at, wrap
-from copem_replay.tracks import TRUTH, VALUES, Tracks
+from copem_replay.core.interpolation import at_instants, states_at, wrap
+from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from scenes import T0_NS
 
 MS = 1_000_000

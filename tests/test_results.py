@@ -16,14 +16,14 @@ from mcap.reader import make_reader
 from pyarrow import parquet
 
 import scenes
-from copem_replay import replay as replays
-from copem_replay.check import read_logs
-from copem_replay.experiment import Experiment
-from copem_replay.results import write_results
-from copem_replay.run import Result, run
-from copem_replay.shown import shown_logs, shown_runs
-from copem_replay.stretches import WHOLE
-from copem_replay.write import RUN_RECORD
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import read_logs
+from copem_replay.io.write.mcap import RUN_RECORD
+from copem_replay.pipeline import log_replay as replays
+from copem_replay.pipeline.chunking import WHOLE
+from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
+from copem_replay.results.write import write_results
 from recordings import Obj, write_recording
 from scenes import experiment
 

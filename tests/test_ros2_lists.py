@@ -12,14 +12,14 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.json_format import ParseDict
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from copem_replay.formats.cdr import CdrDefinition
-from copem_replay.formats.fields import Listed, listed
-from copem_replay.formats.json_messages import JsonDefinition
-from copem_replay.formats.protobuf import ProtobufDefinition
-from copem_replay.formats.ros2_lists import DESCRIPTIONS
-from copem_replay.formats.scene_update import SCHEMAS, description
-from copem_replay.formats.shred import Definition
-from copem_replay.tracks import CLASSES
+from copem_replay.core.tracks import CLASSES
+from copem_replay.io.encodings.cdr import CdrDefinition
+from copem_replay.io.encodings.columns import Definition
+from copem_replay.io.encodings.json import JsonDefinition
+from copem_replay.io.encodings.protobuf import ProtobufDefinition
+from copem_replay.io.schemas.foxglove import SCHEMAS, description
+from copem_replay.io.schemas.object_lists import Listed, listed
+from copem_replay.io.schemas.ros2 import DESCRIPTIONS
 from messages import SEPARATOR, classes, ids, quaternion, serialised, values
 
 COMMON = {

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from copem_replay.rotation import back, combined, turned, yaw_of
+from copem_replay.core.rotation import back, combined, turned, yaw_of
 
 NUMBER = st.floats(-1, 1)
 QUATERNION = (st.tuples(NUMBER, NUMBER, NUMBER, NUMBER).map(np.array).filter(lambda q: np.linalg.norm(q) > 0.1)).map(

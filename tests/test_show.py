@@ -19,15 +19,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.colours import configuration_colours
-from copem_replay.errors import OutputError
-from copem_replay.experiment import Experiment
-from copem_replay.fusion.belief import Belief
-from copem_replay.replay import Replay, believed, prepare, replay_block
-from copem_replay.show import write_rrd
-from copem_replay.show.out import ELAPSED, TIME
-from copem_replay.show.recording import telling
-from copem_replay.tracks import CLASSES
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import OutputError
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import CLASSES
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.viewer import write_rrd
+from copem_replay.viewer.rrd import telling
+from copem_replay.viewer.sink import ELAPSED, TIME
 from scenes import EGO_UNIT, SEES_60_M, SEES_ALL, T0_NS, Thing, driving, experiment, recording, standing
 
 os.environ["RERUN_ANALYTICS"] = "0"  # before it is imported, which is when something is written

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.show.out import slices
-from copem_replay.show.recording import viewed
-from copem_replay.show.status import STATUSES
+from copem_replay.viewer.rrd import viewed
+from copem_replay.viewer.sink import slices
+from copem_replay.viewer.status import STATUSES
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from test_show import SUMMARY, Made, at, chunks, make, rows, static
 from test_show_sight import PERSON, SECTOR, WALL, lines
@@ -212,7 +212,7 @@ def test_of_many_configurations_the_baselines_and_the_first_others_are_shown(tmp
 
 
 def test_what_is_left_out_is_said(tmp_path: Path) -> None:
-    from copem_replay.show import write_rrd
+    from copem_replay.viewer import write_rrd
 
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
     many = {f"GT{k}": {"units": "truth", "latency_s": k / 10} for k in range(8)}
@@ -244,7 +244,7 @@ def test_pieces_are_whole_lists_and_together_all(monkeypatch: pytest.MonkeyPatch
         [Thing(str(k), "car", standing(k, 0), there=lambda t, k=k: t > k / 10 - 0.01) for k in range(5)], until_s=1.0
     )
     truth = scene.truth
-    monkeypatch.setattr("copem_replay.show.out.SLICE_ROWS", 7)
+    monkeypatch.setattr("copem_replay.viewer.sink.SLICE_ROWS", 7)
     pieces = list(slices(truth, truth.valid[0]))
     assert np.concatenate([counts for _, counts, _ in pieces]).tolist() == [1, 2, 3, 4, *[5] * 7]
     assert [rows.size for rows, _, _ in pieces] == [6, 4, *[5] * 7], "as many lists as there is room for, one at least"
@@ -278,8 +278,8 @@ def test_an_entry_that_no_object_is_matched_with(tmp_path: Path) -> None:
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
-    from copem_replay.show.sight import sight
-    from copem_replay.show.status import CAPTURED, KNOWN, LOST, clock_of, status_of
+    from copem_replay.viewer.line_of_sight import sight
+    from copem_replay.viewer.status import CAPTURED, KNOWN, LOST, clock_of, status_of
 
     belief = hiding.beliefs["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
@@ -300,8 +300,8 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     """Two lists of the pole hold pedestrian 4, at 0 and 0.1 s, the next ones do not; no fused list ever does."""
     from dataclasses import replace
 
-    from copem_replay.show.sight import sight
-    from copem_replay.show.status import LOST, UNMATCHED, VISIBLE, status_of
+    from copem_replay.viewer.line_of_sight import sight
+    from copem_replay.viewer.status import LOST, UNMATCHED, VISIBLE, status_of
 
     belief, number = hiding.beliefs["both"], hiding.replay.scene.object_number["4"]
     heard = belief.heard

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.pem.condition import Couple
-from copem_replay.show.units import outlines
+from copem_replay.perception.pem.condition import Couple
+from copem_replay.viewer.sensors import outlines
 from scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, recording, standing
 from test_show import Made, at, chunks, make, rows, static
 

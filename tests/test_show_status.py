@@ -13,13 +13,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay.experiment import Experiment
-from copem_replay.read import Recording, read
-from copem_replay.replay import Replay, believed, prepare, replay_block
-from copem_replay.show import write_rrd
-from copem_replay.show.choice import SHOWN_OBJECTS, telling
-from copem_replay.show.sight import sight
-from copem_replay.show.status import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED, clock_of, status_of
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording, read
+from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.viewer import write_rrd
+from copem_replay.viewer.line_of_sight import sight
+from copem_replay.viewer.selection import SHOWN_OBJECTS, telling
+from copem_replay.viewer.status import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED, clock_of, status_of
 from recordings import SHARED
 from scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from test_show import SUMMARY, at, rows

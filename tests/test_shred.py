@@ -13,10 +13,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, json_format, messag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.formats.json_messages import JsonDefinition
-from copem_replay.formats.protobuf import ProtobufDefinition
-from copem_replay.formats.raw_values import DefinitionError
-from copem_replay.formats.shred import (
+from copem_replay.io.encodings.columns import (
     Definition,
     Level,
     Shredded,
@@ -28,6 +25,9 @@ from copem_replay.formats.shred import (
     rows_above,
     take_apart,
 )
+from copem_replay.io.encodings.json import JsonDefinition
+from copem_replay.io.encodings.protobuf import ProtobufDefinition
+from copem_replay.io.encodings.raw_values import DefinitionError
 from messages import SEPARATOR, defined, serialised, texts
 
 Kinds = descriptor_pb2.FieldDescriptorProto

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from copem_replay.experiment import Experiment
-from copem_replay.read import read
-from copem_replay.run import run
-from copem_replay.sight import in_sight_s
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import read
+from copem_replay.metrics.line_of_sight import in_sight_s
+from copem_replay.pipeline.run import run
 from recordings import Obj, pedestrian, write_recording
 
 EXPERIMENT = {

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.statistics import (
+from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
     LEFT,

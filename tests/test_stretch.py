@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.errors import InputError
-from copem_replay.fusion.component import Inbox, ListFusion, StepFusion, fused_by, resumed_by
+from copem_replay.core.errors import InputError
+from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.fusion.base import Inbox, ListFusion, StepFusion, fused_by, resumed_by
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
-from copem_replay.fusion.stretch import needed_lists, one_after_another, stretch
+from copem_replay.fusion.testing.chunks import needed_lists, one_after_another, stretch
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
 from reports import entry, reports_of, stretches

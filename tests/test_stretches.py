@@ -16,19 +16,20 @@ from hypothesis import strategies as st
 
 import scenes
 import test_recorded
-from copem_replay import cli, stretches
-from copem_replay.accuracy_tables import AccuracyTables
-from copem_replay.believe import listen, seen_by_all
-from copem_replay.check import problems, read_logs
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.fusion.component import ListFusion
-from copem_replay.fusion.object_list import Lists, Reports
+from copem_replay.cli import main as cli
+from copem_replay.core.object_list import Lists, Reports
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.union import Union
-from copem_replay.read import Recording
-from copem_replay.replay import Beliefs, prepare
-from copem_replay.run import Result, run
-from copem_replay.stretches import WHOLE, Reach, Stretch
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline import chunking as stretches
+from copem_replay.pipeline.accuracy_tables import AccuracyTables
+from copem_replay.pipeline.chunking import WHOLE, Reach, Stretch
+from copem_replay.pipeline.log_replay import Beliefs, prepare
+from copem_replay.pipeline.receiver import listen, seen_by_all
+from copem_replay.pipeline.run import Result, run
 from recordings import Obj, pedestrian, write_recording
 from scenes import Thing, driving, experiment, standing
 from test_show import rows
@@ -225,7 +226,7 @@ def test_stretches_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(rows) <= 40
     alone = Beliefs(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
     assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
-    monkeypatch.setattr("copem_replay.replay.ROWS_HELD", 40)
+    monkeypatch.setattr("copem_replay.pipeline.log_replay.ROWS_HELD", 40)
     with pytest.raises(Exception, match="too long to be held at once; take a window of it"):
         Beliefs(replay, experiment(), 0).whole()
 

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from copem_replay.survival import FirstKnown, confirmed, first_of
+from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
 
 SOME = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 DIGITS = 450

@@ -16,17 +16,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from copem_replay import cli
-from copem_replay.accuracy_figures import FIGURES
-from copem_replay.check import problems, read_logs
-from copem_replay.errors import ExperimentError
-from copem_replay.exact import exact_table
-from copem_replay.experiment import Carriers, Experiment
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.read import Recording
-from copem_replay.replay import Replay, prepare
-from copem_replay.run import run
-from copem_replay.sweep import KINDS, Point, points, resolved
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import ExperimentError
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Carriers, Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.pipeline.closed_form import exact_table
+from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.pipeline.run import run
+from copem_replay.pipeline.sweep import KINDS, Point, points, resolved
 from experiments import changed, drive, source_of
 from scenes import Thing, driving, experiment, recording, standing
 

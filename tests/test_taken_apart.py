@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import tree_oracle as plain
-from copem_replay.formats import json_messages
-from copem_replay.formats.json_messages import JsonDefinition
-from copem_replay.formats.protobuf import ProtobufDefinition
+from copem_replay.io.encodings import json as json_messages
+from copem_replay.io.encodings.json import JsonDefinition
+from copem_replay.io.encodings.protobuf import ProtobufDefinition
 from test_shred import OBJECTS, Kinds, in_protobuf, schema
 
 WHOLE = ("int64", "uint64", "int32", "uint32", "sint32", "sint64", "fixed32", "fixed64", "sfixed32", "sfixed64")
@@ -173,7 +173,7 @@ def test_protobuf_2() -> None:
 
 @pytest.mark.parametrize("size", [1, 50, 10**6])
 def test_batches_join(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("copem_replay.formats.shred.BATCH_BYTES", size)
+    monkeypatch.setattr("copem_replay.io.encodings.columns.BATCH_BYTES", size)
     monkeypatch.setattr(json_messages, "_BATCH_BYTES", size)
     definition, payload = in_protobuf(OBJECTS, "List")
     content = [{"t": k, "objects": [{"id": f"{k}{j}", "kind": "CAR"} for j in range(k % 4)]} for k in range(20)]

@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from copem_replay.fusion.component import Inbox, ListFusion, StepFusion
+from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.fusion.base import Inbox, ListFusion, StepFusion
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.fusion.testing.check import RULES, NonconformingError, check_fusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
-from copem_replay.testing import RULES, NonconformingError, check_fusion
 
 OURS = [
     Union(),

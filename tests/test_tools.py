@@ -13,10 +13,10 @@ import pandas as pd
 import pytest
 from scipy.stats import binom
 
-from copem_replay.check import problems, read_logs
-from copem_replay.experiment_file import load
-from copem_replay.run import run
-from copem_replay.statistics import wilson
+from copem_replay.experiment.file import load
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.metrics.survival import wilson
+from copem_replay.pipeline.run import run
 from reports import reports_of
 
 ROOT = Path(__file__).parents[1]
@@ -87,7 +87,7 @@ def test_benchmarks_print_json_lines(
 
 def test_the_benchmarks_plain_loop_reads_what_the_reader_reads(tmp_path: Path) -> None:
     """The ratio compares like with like: as many object states."""
-    from copem_replay.read import read
+    from copem_replay.io.recording import read
 
     world = bench.boxes(5, 7)
     bench._write_truth(tmp_path / "b.mcap", world)

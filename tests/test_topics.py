@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.errors import RecordingError
-from copem_replay.experiment import EgoTopic, ReadFields
-from copem_replay.read import Recording, read
-from copem_replay.resample import states_at
-from copem_replay.tracks import CLASSES
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.interpolation import states_at
+from copem_replay.core.tracks import CLASSES
+from copem_replay.experiment.schema import EgoTopic, ReadFields
+from copem_replay.io.recording import Recording, read
 from recordings import SHARED, Topic, ns, write_mcap
 from ros2 import made, odometry, topic, transform
 

@@ -14,13 +14,13 @@ from mcap_protobuf.decoder import DecoderFactory
 from osi3.osi_sensordata_pb2 import SensorData
 from osi3trace.osi_trace import OSITrace
 
-from copem_replay import container
-from copem_replay.cli import main
-from copem_replay.errors import RecordingError
-from copem_replay.info import survey
-from copem_replay.lists import read_recorded
-from copem_replay.read import read
-from copem_replay.write import OSI_RECORD
+from copem_replay.cli.main import main
+from copem_replay.core.errors import RecordingError
+from copem_replay.experiment.draft.survey import survey
+from copem_replay.io import log as container
+from copem_replay.io.recorded_osi import read_recorded
+from copem_replay.io.recording import read
+from copem_replay.io.write.mcap import OSI_RECORD
 from experiments import changed
 from recordings import SHARED, Obj, ground_truth, pedestrian, sensor_view, write_recording
 

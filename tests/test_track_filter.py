@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.fusion.combine import floored
-from copem_replay.fusion.track_filter import distance2, predict, update
+from copem_replay.fusion.covariance import floored
+from copem_replay.fusion.tracker_filter import distance2, predict, update
 
 Array = npt.NDArray[np.float64]
 H = np.eye(2, 4)

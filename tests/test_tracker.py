@@ -13,11 +13,11 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.fusion.agree import AGREE, most_probable, most_probable_of_each
-from copem_replay.fusion.component import fused_by
-from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.agree import AGREE, most_probable, most_probable_of_each
+from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.tracks import CLASSES
+from copem_replay.fusion.base import fused_by
 from copem_replay.fusion.tracker import Tracker
-from copem_replay.tracks import CLASSES
 from gnn_oracle import largest_around
 from reports import entry, joined, lists_of, reports_of
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.tracks import CLASS_GROUPS, CLASSES, UNCERTAINTIES, VALUES, Scene, Tracks, class_indices
+from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, UNCERTAINTIES, VALUES, Scene, Tracks, class_indices
 
 Seen = dict[str, list[list[str]]]
 """What each unit lists: its lists in order of capture, each the objects it holds."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from copem_replay.fusion.object_list import entries_of
+from copem_replay.core.object_list import entries_of
 from copem_replay.fusion.union import Union
 from gnn_oracle import in_any_order, random_reports
 from reports import entry, joined, reports_of

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from copem_replay.colours import configuration_colours
-from copem_replay.errors import InputError
-from copem_replay.show import check_viewer, write_rrd
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import InputError
+from copem_replay.viewer import check_viewer, write_rrd
 from test_show import CHANGES, SUMMARY, Made, approaching, make, rerun, rows
 from viewer import Viewer, free_port, headless_viewer
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.read import read
-from copem_replay.tracks import Tracks
-from copem_replay.visibility import (
+from copem_replay.core.tracks import Tracks
+from copem_replay.io.recording import read
+from copem_replay.perception.visibility import (
     NO_STATICS,
     Observers,
     Statics,

@@ -18,15 +18,18 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from copem_replay import chunks, cli, container, indexed
-from copem_replay.check import read_logs
-from copem_replay.errors import EmptyWindowError, RecordingError
-from copem_replay.experiment import Experiment
-from copem_replay.plain_yaml import dump
-from copem_replay.plain_yaml import read as read_yaml
-from copem_replay.read import Recording, read
-from copem_replay.run import run
-from copem_replay.tracks import VALUES
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import EmptyWindowError, RecordingError
+from copem_replay.core.tracks import VALUES
+from copem_replay.core.yaml import dump
+from copem_replay.core.yaml import read as read_yaml
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import read_logs
+from copem_replay.io import log as container
+from copem_replay.io.containers import mcap_indexed as indexed
+from copem_replay.io.containers import mcap_records as chunks
+from copem_replay.io.recording import Recording, read
+from copem_replay.pipeline.run import run
 from experiments import changed
 from recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
 from ros2 import header, made, odometry, pose, topic, transform

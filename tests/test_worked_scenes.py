@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import scenes
-from copem_replay.candidates import candidates
-from copem_replay.read import Recording
-from copem_replay.resample import at_instants
-from copem_replay.run import Result, run
+from copem_replay.core.interpolation import at_instants
+from copem_replay.io.recording import Recording
+from copem_replay.perception.observation import candidates
+from copem_replay.pipeline.run import Result, run
 from scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 

@@ -20,19 +20,20 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from osi3.osi_sensordata_pb2 import SensorData
 
-from copem_replay.check import problems, read_logs
-from copem_replay.colours import configuration_colours
-from copem_replay.errors import OutputError, RecordingError
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.families import family_of
-from copem_replay.formats import detail, sensor_data
-from copem_replay.fusion.belief import Belief
-from copem_replay.lists import read_lists
-from copem_replay.read import read
-from copem_replay.replay import Replay, believed, prepare, replay_block
-from copem_replay.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES
-from copem_replay.write import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import OutputError, RecordingError
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recorded_osi import read_lists
+from copem_replay.io.recording import read
+from copem_replay.io.write import detail_json as detail
+from copem_replay.io.write import osi_sensor_data as sensor_data
+from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
+from copem_replay.io.write.message_family import family_of
+from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "logs/tc016d.mcap"
@@ -470,7 +471,7 @@ KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
-import copem_replay.write as write
+import copem_replay.io.write.mcap as write
 from test_write import Written
 folder = Path({folder!r})
 original = write.Writer.add_message

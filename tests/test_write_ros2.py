@@ -15,19 +15,19 @@ from mcap.writer import Writer
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from copem_replay.check import problems, read_logs
-from copem_replay.experiment import Experiment
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.families import family_of
-from copem_replay.formats.detected_objects import LABELS
-from copem_replay.fusion.belief import Belief
-from copem_replay.read import Recording, read
-from copem_replay.replay import Replay, believed, prepare, replay_block
-from copem_replay.results import write_results
-from copem_replay.run import run
-from copem_replay.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES
-from copem_replay.unit_lists import read_listed
-from copem_replay.write import OSI_RECORD, RUN_RECORD, write_mcap
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recorded_lists import read_listed
+from copem_replay.io.recording import Recording, read
+from copem_replay.io.write.autoware_objects import LABELS
+from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, write_mcap
+from copem_replay.io.write.message_family import family_of
+from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.pipeline.run import run
+from copem_replay.results.write import write_results
 from recordings import SHARED, Obj, ns, write_recording
 
 TRACKED = """\

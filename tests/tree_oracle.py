@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.formats.shred import as_text, level_of, levels_to
+from copem_replay.io.encodings.columns import as_text, level_of, levels_to
 
 UNLIKE = (TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 

@@ -22,12 +22,12 @@ import bench_fusion
 import bench_long
 import bench_read
 import bench_viewer
-from copem_replay.check import problems, read_logs
-from copem_replay.experiment_file import load, log_paths
-from copem_replay.read import read
-from copem_replay.replay import believed, prepare, replay_block
-from copem_replay.tracks import TRUTH, Tracks
-from copem_replay.visibility import NO_STATICS, Observers, visible_shares
+from copem_replay.core.tracks import TRUTH, Tracks
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recording import read
+from copem_replay.perception.visibility import NO_STATICS, Observers, visible_shares
+from copem_replay.pipeline.log_replay import believed, prepare, replay_block
 
 ROOT = Path(__file__).parents[1]
 
@@ -95,7 +95,7 @@ def paper() -> Iterator[dict[str, object]]:
     time that goes by in the scenario (after reading and compilation, workers as many as cores); most of the work is
     accuracy (RMSE, GOSPA, …).
     """
-    from copem_replay.run import run
+    from copem_replay.pipeline.run import run
 
     experiment, recordings = _loaded(ROOT / "logs/tc016d.yaml")
     listed = experiment.model_copy(update={"braking": None})
@@ -131,9 +131,9 @@ def reading() -> Iterator[dict[str, object]]:
 
 def writing() -> Iterator[dict[str, object]]:
     """The crossing: objects per second into MCAP, boxes per second and bytes per box into .rrd, seconds to see it."""
-    from copem_replay.show import write_rrd
-    from copem_replay.summary import horizon_s, summary
-    from copem_replay.write import write_mcap
+    from copem_replay.io.write.mcap import write_mcap
+    from copem_replay.metrics.summary import horizon_s, summary
+    from copem_replay.viewer import write_rrd
 
     experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
     experiment = experiment.model_copy(update={"configurations": experiment.shown()})
@@ -159,7 +159,7 @@ def writing() -> Iterator[dict[str, object]]:
 
 def commands() -> Iterator[dict[str, object]]:
     """Seconds of `--help` and `info`, seconds and peak memory of what `make demo` runs."""
-    tool = [sys.executable, "-m", "copem_replay.cli"]
+    tool = [sys.executable, "-m", "copem_replay.cli.main"]
     for name, words in (("help", ["--help"]), ("info", ["info", str(ROOT / "logs/tc016d.mcap")])):
         seconds = best(lambda words=words: subprocess.run([*tool, *words], check=True, stdout=subprocess.DEVNULL), 3)
         yield {f"{name}_s": round(seconds, 3)}

@@ -18,19 +18,19 @@ from pathlib import Path
 import numba as nb
 import numpy as np
 
-from copem_replay.believe import World, _without_truth, listen, seen_by_all
-from copem_replay.experiment import Configuration, Experiment
-from copem_replay.fusion.component import ListFusion
+from copem_replay.communication.arrivals import instants
+from copem_replay.core.object_list import COVARIANCES, Lists, Reports, entries_of
+from copem_replay.core.tracks import CLASSES, Float, Tracks
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.ideal import fuse
-from copem_replay.fusion.instants import instants
-from copem_replay.fusion.object_list import COVARIANCES, Lists, Reports, entries_of
-from copem_replay.fusion.reports import reports
+from copem_replay.fusion.inputs import reports
 from copem_replay.fusion.tracker import Tracker
-from copem_replay.gospa import gospa, gospa_pairs
-from copem_replay.read import Recording
-from copem_replay.replay import blocks, prepare
-from copem_replay.tracks import CLASSES, Float, Tracks
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.gospa import gospa, gospa_pairs
+from copem_replay.pipeline.log_replay import blocks, prepare
+from copem_replay.pipeline.receiver import World, _without_truth, listen, seen_by_all
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 

@@ -64,7 +64,7 @@ def long(folder: Path, minutes: Sequence[float] = (15, 60), objects: int = 100) 
 
 def measured(arguments: Sequence[str], folder: Path) -> tuple[float, float]:
     """Seconds and peak memory (MB) of a command. Raises CalledProcessError where it fails."""
-    command = [sys.executable, "-m", "copem_replay.cli", *arguments]
+    command = [sys.executable, "-m", "copem_replay.cli.main", *arguments]
     begin = time.perf_counter()
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL) as process:
         _, status, usage = os.wait4(process.pid, 0)

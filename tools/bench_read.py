@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from copem_replay.read import read
+from copem_replay.io.recording import read
 
 FRAMES, COUNT, STEP_S = 1200, 60, 0.05
 STATES = FRAMES * COUNT

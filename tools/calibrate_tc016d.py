@@ -20,13 +20,13 @@ from typing import Final
 import numpy as np
 from scipy.optimize import minimize
 
-from copem_replay.braking.driver import ConstantDeceleration, GammaReaction
-from copem_replay.braking.verdict import pass_probability, passing
-from copem_replay.check import problems, read_logs
-from copem_replay.exact import distributions
-from copem_replay.experiment_file import load
-from copem_replay.replay import Replay, prepare
-from copem_replay.statistics import wilson
+from copem_replay.experiment.file import load
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.metrics.braking.driver import ConstantDeceleration, GammaReaction
+from copem_replay.metrics.braking.verdict import pass_probability, passing
+from copem_replay.metrics.survival import wilson
+from copem_replay.pipeline.closed_form import distributions
+from copem_replay.pipeline.log_replay import Replay, prepare
 from make_logs import tc016d, write_recording
 from paper import PASSED, RUNS
 

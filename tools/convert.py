@@ -21,8 +21,8 @@ from converters import argoverse2, commonroad, csv_rows, openlabel, scenarionet,
 from converters.parse import number, positive
 from converters.scenario_folder import scenarios
 from converters.trace import RECORD, Frame, Report, write
-from copem_replay.errors import InputError
-from copem_replay.wording import counted
+from copem_replay.core.errors import InputError
+from copem_replay.core.text import counted
 
 _MOST_LINES = 10
 """Of one kind that are printed (chosen): a data set has thousands of scenarios."""

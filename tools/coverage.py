@@ -21,9 +21,9 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from copem_replay.intervals import bootstrap_share, resamples, share_limits
-from copem_replay.table import as_text
-from copem_replay.tracks import Float
+from copem_replay.core.tracks import Float
+from copem_replay.metrics.intervals import bootstrap_share, resamples, share_limits
+from copem_replay.metrics.summary_text import as_text
 
 CLUSTERS: Final = (5, 8, 12, 20, 30, 60, 120)
 Draw = Callable[[np.random.Generator, int], Float]

@@ -19,8 +19,8 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 
-from copem_replay.atomic import atomic_file
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
+from copem_replay.core.files import atomic_file
 
 PREFIX, SUFFIX = "copem/", "/scene"
 EYE = {"perspective": True, "phi": 55, "thetaOffset": 45, "fovy": 45, "near": 0.5, "far": 5000}

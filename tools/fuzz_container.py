@@ -171,7 +171,7 @@ def compressed(plain: bytes, compression: str) -> bytes:
 
 def taken_apart(path: Path, most: int) -> Sample:
     """The first `most` messages of each channel."""
-    from copem_replay.salvage import FromStart
+    from copem_replay.io.containers.mcap_recovery import FromStart
 
     counts, messages = Counter[int](), []
     with path.open("rb") as file:

@@ -37,12 +37,14 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
 
     It is surveyed and read; `looked` is called then, and its other lists are read and its messages copied.
     """
-    from copem_replay import container, lists, unit_lists
-    from copem_replay.errors import InputError, RecordingError
-    from copem_replay.formats import osi
-    from copem_replay.info import describe, survey
-    from copem_replay.originals import source_of
-    from copem_replay.read import read
+    from copem_replay.core.errors import InputError, RecordingError
+    from copem_replay.experiment.draft.survey import describe, survey
+    from copem_replay.io import log as container
+    from copem_replay.io import recorded_lists as unit_lists
+    from copem_replay.io import recorded_osi as lists
+    from copem_replay.io.recording import read
+    from copem_replay.io.schemas import osi_ground_truth as osi
+    from copem_replay.io.write.source import source_of
 
     said: list[str] = []
     with warnings.catch_warnings():

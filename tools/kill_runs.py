@@ -60,7 +60,8 @@ class Trial:
         if child:
             return child
         try:
-            from copem_replay import cli, place
+            from copem_replay.cli import main as cli
+            from copem_replay.results import place
 
             if self.two_steps:
                 place.exchange = lambda *_: False
@@ -151,14 +152,10 @@ def ended(child: int) -> int | None:
 
 def warmed(path: Path) -> None:
     """Import and load what a run needs, so that forks need not: all but Rerun's threads, which no fork would have."""
-    import copem_replay.place
-    import copem_replay.results
-    import copem_replay.show
-    import copem_replay.table
-    import copem_replay.write  # noqa: F401
-    from copem_replay.check import problems, read_logs
-    from copem_replay.experiment_file import load, log_paths
-    from copem_replay.run import run
+    import copem_replay.io.write.mcap  # noqa: F401
+    from copem_replay.experiment.file import load, log_paths
+    from copem_replay.experiment.validate import problems, read_logs
+    from copem_replay.pipeline.run import run
 
     source = load(path)
     experiment, _ = problems(source)

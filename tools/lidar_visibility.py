@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from copem_replay.errors import CopemError
-from copem_replay.read import Recording, read
-from copem_replay.tracks import CLASSES, Float
-from copem_replay.visibility import NO_STATICS, Observers, visible_shares
+from copem_replay.core.errors import CopemError
+from copem_replay.core.tracks import CLASSES, Float
+from copem_replay.io.recording import Recording, read
+from copem_replay.perception.visibility import NO_STATICS, Observers, visible_shares
 
 WITHIN_M = 60.0
 SENSOR_HEIGHT_M = 1.9

@@ -60,11 +60,11 @@ def main() -> None:
 
 def _replay(folder: Path) -> None:
     """`copem-replay run logs/tc016d.yaml`, with the median run shown."""
-    from copem_replay.check import problems, read_logs
-    from copem_replay.experiment import Show
-    from copem_replay.experiment_file import load, log_paths
-    from copem_replay.results import write_results
-    from copem_replay.run import run
+    from copem_replay.experiment.file import load, log_paths
+    from copem_replay.experiment.schema import Show
+    from copem_replay.experiment.validate import problems, read_logs
+    from copem_replay.pipeline.run import run
+    from copem_replay.results.write import write_results
 
     source = load(ROOT / "logs/tc016d.yaml")
     experiment, wrong = problems(source)
@@ -77,14 +77,14 @@ def _replay(folder: Path) -> None:
 
 def _differences(folder: Path, out: Path) -> None:
     """`copem-replay compare --rrd`: two latencies beside the car's own perception."""
-    from copem_replay.compare.beside import write_beside
+    from copem_replay.viewer.side_by_side import write_beside
 
     write_beside(out, [folder], configurations=["coPEM:0.5s", "coPEM:1s"], baseline="PEM")
 
 
 def _drawn(folder: Path) -> Picture:
     """The figure of single runs of `copem-replay plot`."""
-    from copem_replay.plot import load_results, runs_figure
+    from copem_replay.report.figures import load_results, runs_figure
 
     content = io.BytesIO()
     runs_figure(load_results(folder)).savefig(content, format="png", dpi=130)

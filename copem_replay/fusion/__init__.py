@@ -1,7 +1,7 @@
 """Fusion: what the receiver believes, from the lists that have arrived (f of the paper's coPEM)."""
 
 FUSIONS = {
-    "ideal": "copem_replay.fusion.component:Ideal",
+    "ideal": "copem_replay.fusion.base:Ideal",
     "union": "copem_replay.fusion.union:Union",
     "nms": "copem_replay.fusion.nms:Nms",
     "gnn": "copem_replay.fusion.gnn:Gnn",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from copem_replay.tracks import Float, Int
+from copem_replay.core.tracks import Float, Int
 
 _BLOCK = 16
 """So few are put in order one by one (chosen)."""

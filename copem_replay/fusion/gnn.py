@@ -8,13 +8,13 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from copem_replay.components import Share
-from copem_replay.fusion.agree import AGREE
-from copem_replay.fusion.cluster_kernel import fuse_run, intersect
-from copem_replay.fusion.component import ListFusion
-from copem_replay.fusion.object_list import ENTRY, Entries, Lists, Reports
+from copem_replay.core.agree import AGREE
+from copem_replay.core.components import Share
+from copem_replay.core.object_list import ENTRY, Entries, Lists, Reports
+from copem_replay.core.tracks import Float
+from copem_replay.fusion.base import ListFusion
+from copem_replay.fusion.gnn_kernel import fuse_run, intersect
 from copem_replay.fusion.union import run_after_run
-from copem_replay.tracks import Float
 
 
 class Gnn(ListFusion):
@@ -27,7 +27,7 @@ class Gnn(ListFusion):
     correlation; of least trace or, `minimise`, determinant), in closed form if fast, which gives the best member
     where that is better. Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height, velocity, size and yaw
     (on the circle) the mean by inverse trace of the position covariance. Source: S. Blackman, R. Popoli, "Design and
-    Analysis of Modern Tracking Systems", 1999 (assignment, its cost and gate); fusion/combine.py, and for the running
+    Analysis of Modern Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py, and for the running
     state by which intersecting clusters are compared W. Niehsen, "Information fusion based on fast covariance
     intersection filtering", FUSION 2002. Assumes Gaussian position errors of the stated covariance without bias, and
     lists of about one instant. A stale list of a moving object, a biased unit or too small a covariance leaves it as a

@@ -12,11 +12,11 @@ from dataclasses import replace
 import numba as nb
 import numpy as np
 
-from copem_replay.chance import Address, Dice, object_words
-from copem_replay.fusion.belief import Belief
-from copem_replay.fusion.combine import FLATTEST
-from copem_replay.fusion.instants import Instants, instants
-from copem_replay.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.communication.arrivals import Instants, instants
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.fusion.covariance import FLATTEST
 
 SMALLEST_VARIANCE = 1e-9
 """A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""

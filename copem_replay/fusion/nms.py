@@ -7,16 +7,16 @@ from typing import Any, ClassVar, Literal
 import numba as nb
 import numpy as np
 
-from copem_replay.components import Positive, Share
-from copem_replay.fusion.agree import AGREE, most_probable_of_each
-from copem_replay.fusion.cluster_kernel import WIDTH
-from copem_replay.fusion.component import ListFusion
+from copem_replay.core.agree import AGREE, most_probable_of_each
+from copem_replay.core.components import Positive, Share
+from copem_replay.core.object_list import Entries, Lists, Reports
+from copem_replay.core.overlap import rotated_iou
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.content_order import sort_rows
 from copem_replay.fusion.gnn import numbers
-from copem_replay.fusion.object_list import Entries, Lists, Reports
-from copem_replay.fusion.overlap import rotated_iou
+from copem_replay.fusion.gnn_kernel import WIDTH
 from copem_replay.fusion.union import run_after_run, side_by_side
-from copem_replay.tracks import Bool, Float, Int
 
 
 class Nms(ListFusion):

@@ -9,16 +9,16 @@ from typing import Annotated, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.components import NotNegative, Positive, Share
-from copem_replay.fusion.agree import AGREE
-from copem_replay.fusion.component import ListFusion
+from copem_replay.core.agree import AGREE
+from copem_replay.core.components import NotNegative, Positive, Share
+from copem_replay.core.interpolation import wrap
+from copem_replay.core.object_list import ENTRY, Lists, Reports
+from copem_replay.core.tracks import Float, Int
+from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.content_order import rows_in_order
-from copem_replay.fusion.object_list import ENTRY, Lists, Reports
-from copem_replay.fusion.track_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
-from copem_replay.fusion.track_memory import Remembered, nothing_yet
+from copem_replay.fusion.tracker_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
+from copem_replay.fusion.tracker_memory import Remembered, nothing_yet
 from copem_replay.fusion.union import run_after_run
-from copem_replay.resample import wrap
-from copem_replay.tracks import Float, Int
 
 _CONTENT = ENTRY.fields["captured_s"][1] // 8 if ENTRY.fields else 0
 """So many numbers of an entry say what it is; when and whose it is stands behind them."""

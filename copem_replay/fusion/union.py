@@ -8,10 +8,10 @@ from typing import ClassVar, Literal
 import numba as nb
 import numpy as np
 
-from copem_replay.components import Share
-from copem_replay.fusion.component import ListFusion
-from copem_replay.fusion.object_list import Entries, Lists, Reports, entries_of
-from copem_replay.tracks import Bool, Int
+from copem_replay.core.components import Share
+from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.tracks import Bool, Int
+from copem_replay.fusion.base import ListFusion
 
 
 class Union(ListFusion):

@@ -10,6 +10,6 @@
 | `page`, `write` | the page, and the file |
 """
 
-from copem_replay.report.write import REPORT, check_report, write_report
+from copem_replay.report.html.write import REPORT, check_report, write_report
 
 __all__ = ["REPORT", "check_report", "write_report"]

@@ -19,7 +19,7 @@ from converters.parse import number, positive, seconds_as_ns, shown
 from converters.rotate import wrapped
 from converters.trace import Box, Frame, Report
 from converters.xml_nodes import Node, parts
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 _KIND: Final = {
     "bicycle": "bicycle",

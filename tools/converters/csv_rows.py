@@ -13,7 +13,7 @@ from converters.kinds import KINDS, Kind
 from converters.parse import number, numbered, positive, seconds_as_ns, shown
 from converters.rotate import wrapped
 from converters.trace import Box, Frame, Report
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 REQUIRED: Final = ("time_s", "id", "class", "x_m", "y_m", "length_m", "width_m")
 YAW: Final = ("yaw_deg", "yaw_rad")  # one of them

@@ -7,7 +7,7 @@ from typing import Final
 
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
-from copem_replay.repair import HEIGHTS_M
+from copem_replay.io.plausibility import HEIGHTS_M
 
 Vehicle = MovingObject.VehicleClassification
 Static = StationaryObject.Classification

@@ -22,8 +22,8 @@ from converters.kinds import KINDS, Kind
 from converters.openlabel_frames import Edges
 from converters.parse import number, numbered, seconds_as_ns, shown
 from converters.trace import Box, Frame, Report
-from copem_replay.errors import InputError
-from copem_replay.tracks import Float
+from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import Float
 
 _NOWHERE_M: Final = -1000.0  # KITTI's position of what is none
 _KIND: Final = {  # lower case, without spaces and underscores

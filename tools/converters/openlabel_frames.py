@@ -13,8 +13,8 @@ import numpy as np
 
 from converters import rotate
 from converters.parse import number, shown
-from copem_replay.errors import InputError
-from copem_replay.tracks import Float
+from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import Float
 
 Edges = dict[tuple[str, str], Float]
 """(4, 4) matrices by (from, to)."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from decimal import Decimal
 from typing import Final
 
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 LAST_SECOND: Final = 4_000_000_000  # Unix time of 2096; the reader takes no later stamp
 _LARGEST_ID: Final = 2**63 - 1  # chosen: OSI ids have 64 bits, many readers keep them signed

@@ -19,7 +19,7 @@ from typing import Any, Final, SupportsIndex
 
 import numpy as np
 
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 _TIMES: Final = 16
 """How many times as many numbers and characters as the file has bytes may be made of it (chosen; about 1 is usual)."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from copem_replay.tracks import Float
+from copem_replay.core.tracks import Float
 
 
 def of_quaternion(w: Float, x: Float, y: Float, z: Float) -> Float:

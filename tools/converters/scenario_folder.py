@@ -11,7 +11,7 @@ from typing import Final
 
 from converters import restricted_pickle
 from converters.parse import shown
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 _MAPPING: Final = "dataset_mapping.pkl"
 _SUMMARY: Final = "dataset_summary.pkl"  # of the metadata, which the scenarios have themselves

@@ -20,9 +20,9 @@ from converters.kinds import KINDS, Kind
 from converters.parse import LAST_SECOND, numbered, shown
 from converters.rotate import wrapped
 from converters.trace import Box, Frame, Report
-from copem_replay.errors import InputError
-from copem_replay.tracks import Bool, Float
-from copem_replay.wording import counted
+from copem_replay.core.errors import InputError
+from copem_replay.core.text import counted
+from copem_replay.core.tracks import Bool, Float
 
 _MOST_COLUMNS: Final = 16  # chosen; there are at most 3
 _MOST_STEPS: Final = 10_000_000  # chosen: eleven days at 10 Hz

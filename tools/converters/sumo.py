@@ -17,7 +17,7 @@ from converters.rotate import wrapped
 from converters.sumo_types import VehicleType, of_class, types
 from converters.trace import Box, Frame, Report
 from converters.xml_nodes import Node, parts
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 _SHOWN: Final = 12  # ids named in an error (chosen)
 _CLASS: Final = {"vehicle": "passenger", "person": "pedestrian"}

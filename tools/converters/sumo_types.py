@@ -14,7 +14,7 @@ from typing import Final
 from converters.kinds import KINDS, Kind
 from converters.parse import positive
 from converters.xml_nodes import Node, parts
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 _CLASSES: Final = {  # vClass: kind, length, width, height in m
     "passenger": ("car", 5.0, 1.8, 1.5),

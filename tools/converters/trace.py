@@ -15,8 +15,8 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 
 from converters.kinds import Kind
 from converters.parse import LAST_SECOND
-from copem_replay.errors import InputError
-from copem_replay.wording import counted
+from copem_replay.core.errors import InputError
+from copem_replay.core.text import counted
 from make_logs import NANOS_PER_SECOND, Recording, write_recording
 
 TOPIC: Final = "ground_truth"

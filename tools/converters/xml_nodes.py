@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 from xml.parsers import expat
 
-from copem_replay.errors import InputError
+from copem_replay.core.errors import InputError
 
 _BLOCK_BYTES: Final = 1 << 16
 

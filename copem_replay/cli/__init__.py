@@ -1,0 +1,1 @@
+"""Commands, options, exit codes: a few lines around the library each."""

@@ -1,0 +1,1 @@
+"""When each list arrives, and the instants at which the receiver fuses."""

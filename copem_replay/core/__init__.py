@@ -1,0 +1,1 @@
+"""Types everything shares: scenes, tracks, object lists, random numbers, geometry, errors."""

@@ -1,0 +1,191 @@
+"""Components: a component is its configuration, a frozen model with one method.
+
+`kind:` is a built-in name, the name of an installed entry point (group `copem_replay.<slot>`), or
+`package.module:Class`. There is no registry and nothing happens on import: a class is looked up when an experiment
+names it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from importlib.metadata import entry_points
+from typing import Annotated, Any, TypeVar
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+    WithJsonSchema,
+)
+from pydantic_core import PydanticCustomError, core_schema
+
+from copem_replay.core.errors import InputError
+from copem_replay.core.own_code import FAILURES, failed, is_own, written_at
+
+T = TypeVar("T")
+
+
+class Frozen(BaseModel):
+    """Base of all models: immutable, and a key that is not known is refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Component(Frozen):
+    """Base of all components, ours and the users' own."""
+
+    kind: str
+
+
+class GivenError(TypeError):
+    """A method of a component gave something else than it should: which one, and what."""
+
+    def __init__(self, method: str, message: str) -> None:
+        super().__init__(f"{method}: {message}")
+        self.method = method
+
+
+def asked(component: Component, where: str, work: Callable[[], T]) -> T:
+    """What a component answers. Raises InputError where a user's own one fails; a failure of ours stays a defect."""
+    try:
+        return work()
+    except FAILURES as error:
+        if not is_own(type(component)):
+            raise
+        if isinstance(error, GivenError):
+            raise wrong(component, where, str(error), error.method) from error
+        raise InputError(f"{where}: {component.kind}: {failed(error, type(component))}") from error
+
+
+def wrong(component: Component, where: str, message: str, *methods: str) -> InputError:
+    """The error that what a component gave is wrong, with file and line of the first of these methods that is own."""
+    return InputError(f"{where}: {component.kind}: {message}{written_at(type(component), *methods)}")
+
+
+_LARGEST = 1e12
+"""Chosen: no quantity of an experiment is larger, and products of two such numbers are still numbers."""
+Number = Annotated[float, Field(strict=True, ge=-_LARGEST, le=_LARGEST)]
+"""A number; text and true/false are refused."""
+Positive = Annotated[float, Field(strict=True, gt=0, le=_LARGEST)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, le=_LARGEST)]
+Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+Count = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Flag = Annotated[bool, Field(strict=True)]
+"""True or false; `yes` is text."""
+
+
+def _identifier(value: object) -> object:
+    """Ids may be numbers or text: `1` is `"1"`."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+Id = Annotated[str, BeforeValidator(_identifier), WithJsonSchema({"type": ["string", "integer"]})]
+
+
+class Slot:
+    """Annotation of a field that holds a component: `Annotated[DetectionModel, Slot("detection", {...})]`.
+
+    `built_in` maps names to `package.module:Class`, so that nothing is imported before it is used. `default`: the kind
+    where none is said.
+    """
+
+    def __init__(self, name: str, built_in: Mapping[str, str], default: str | None = None) -> None:
+        self.name = name
+        self.default = default
+        self.built_in = dict(built_in)
+        self.base: type[Any] = Component
+
+    def __get_pydantic_core_schema__(self, source: type[Any], handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        """Validation: find the class that `kind` names and let it validate the rest."""
+        self.base = source
+        return core_schema.no_info_plain_validator_function(
+            self.build,
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda c: c.model_dump(mode="json", by_alias=True)
+            ),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """JSON Schema: one alternative per installed component, and one for `package.module:Class`."""
+        alternatives = []
+        for kind in self.kinds():
+            try:
+                component = self.find(kind)
+            except PydanticCustomError:  # an entry point of another package that is broken: not to be had
+                continue
+            found = deepcopy(handler.resolve_ref_schema(handler(component.__pydantic_core_schema__)))
+            if kind == self.default:
+                found["properties"]["kind"] = {"const": kind, "default": kind}
+            else:
+                found["properties"]["kind"] = {"const": kind}
+                found["required"] = sorted({*found.get("required", []), "kind"})
+            alternatives.append(found)
+        own = {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]}
+        return {"anyOf": [*alternatives, own]}
+
+    def kinds(self) -> list[str]:
+        """Names that can stand in `kind:` besides `package.module:Class`."""
+        return [*self.built_in, *sorted(e.name for e in entry_points(group=f"copem_replay.{self.name}"))]
+
+    def find(self, kind: str) -> type[Component]:
+        """The class `kind` names. Raises PydanticCustomError, which reads as a problem of the experiment file."""
+        if kind in self.built_in:
+            target = self.built_in[kind]
+        elif found := [e for e in entry_points(group=f"copem_replay.{self.name}") if e.name == kind]:
+            target = found[0].value
+        elif ":" in kind:
+            target = kind
+        else:
+            known = ", ".join(self.kinds())
+            raise _problem(f"kind: expected one of {known}, or package.module:Class; found {kind!r}")
+        module, _, name = target.partition(":")
+        try:
+            component = getattr(importlib.import_module(module), name)
+        except FAILURES as error:  # whatever a module of the user's raises
+            away = isinstance(error, ModuleNotFoundError) and module.startswith(str(error.name))
+            hint = " (install it, or name its folder in PYTHONPATH)" if away else ""
+            raise _problem(f"kind: {kind!r} cannot be imported: {failed(error)}{hint}") from error
+        if not (isinstance(component, type) and issubclass(component, self.base)) or component is self.base:
+            raise _problem(
+                f"kind: {kind!r} is no kind of {self.base.__module__}.{self.base.__name__}; derive it from that"
+            )
+        if inspect.isabstract(component):
+            lacking = ", ".join(sorted(vars(component)["__abstractmethods__"]))
+            raise _problem(f"kind: {kind!r} lacks {lacking}")
+        return component
+
+    def build(self, value: object) -> Component:
+        """A component from what the experiment says of it."""
+        if isinstance(value, Component):
+            return value
+        if self.default is not None and isinstance(value, Mapping) and "kind" not in value:
+            value = {"kind": self.default, **value}
+        if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
+            found = "nothing" if value is None else repr(value)
+            raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {found}")
+        component = self.find(value["kind"])
+        try:
+            return component.model_validate(dict(value))
+        except ValidationError:
+            raise
+        except FAILURES as error:  # of a constructor of the user's
+            if not is_own(component):
+                raise
+            raise _problem(f"kind: {value['kind']!r} cannot be made: {failed(error, component)}") from error
+
+
+def _problem(message: str) -> PydanticCustomError:
+    # The message is a constant to pydantic: braces of the text must not be read as fields.
+    return PydanticCustomError("component", "{message}", {"message": message})
+
+
+__all__ = ["Component", "Count", "Flag", "Frozen", "Id", "NotNegative", "Number", "Positive", "Share", "Slot"]

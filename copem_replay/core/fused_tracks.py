@@ -1,0 +1,114 @@
+"""What the receiver believes in one run or several, as tracks: for writing, for showing, and for what they imply."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba as nb
+import numpy as np
+
+from copem_replay.core.agree import most_probable_of_each
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.core.view_geometry import Look
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What the receiver believes, and which entries of the units' lists each fused row was made of.
+
+    Of what goes by lists without truth only the rows are known, not what they were made of: `said` is then what the
+    fusion says of each row (P,), in one run, and a track's `object_ix` the true object it is matched with, −1: none.
+    """
+
+    fused: Tracks
+    heard: Tracks
+    entries: Int  # (C,) rows of `heard`, those that were not detected too
+    start: Int  # (P + 1,) where the entries of each fused row begin
+    look: Look | None = None  # how the rows of `heard` look from their units; the truth needs none
+    said: Entries | None = None
+
+    @cached_property
+    def used(self) -> Int:
+        """The entries that were detected, (C',) rows of `heard`, grouped by `used_start`."""
+        detected: Bool = self.heard.valid[0, self.entries]
+        return self.entries[detected]
+
+    @cached_property
+    def used_start(self) -> Int:
+        """(P + 1,) where the detected entries of each fused row begin."""
+        before: Int = np.concatenate([[0], np.cumsum(self.heard.valid[0, self.entries])])
+        starts: Int = before[self.start]
+        return starts
+
+    @cached_property
+    def captured_s(self) -> Float:
+        """(S, P) the newest capture that contributed to each row, −inf where none did."""
+        if self.said is not None:
+            return np.asarray(self.said["captured_s"], dtype=np.float64)[None]
+        newest_s = np.full(self.fused.valid.shape, -np.inf)
+        _newest(self.heard.valid, self.heard.row_captured_s, self.entries, self.start, newest_s)
+        return newest_s
+
+    @cached_property
+    def first_unit_ix(self) -> Int:
+        """(S, P) of the units that contributed to each row the one whose list arrived first; −1: none, or not said."""
+        if self.said is not None:
+            return np.asarray(self.said["unit_ix"], dtype=np.int64)[None]
+        first = np.full(self.fused.valid.shape, -1)
+        arrives_s = self.heard.arrives_s[0, self.heard.frame_ix]
+        _first_unit(self.heard.valid, arrives_s, self.heard.row_unit_ix, self.entries, self.start, first)
+        return first
+
+    @cached_property
+    def _place(self) -> Int:
+        """(P,) places of rows in their lists."""
+        order, bounds = self.fused.by_frame
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order)) - np.repeat(bounds[:-1], np.diff(bounds))
+        return place
+
+    def name_of(self, scene: Scene, row: int) -> str:
+        """The id of the object a row is about, else the fusion's own identity for it, else its place in its list."""
+        object_ix = int(self.fused.row_object_ix[row])
+        if object_ix >= 0:
+            return scene.object_ids[object_ix]
+        track_id = -1 if self.said is None else int(self.said["track_id"][row])
+        return f"track:{track_id}" if track_id >= 0 else f"entry:{self._place[row]}"
+
+    def class_of(self, scene: Scene) -> Int:
+        """(P,) index into CLASSES: the true one, or what the fusion takes it for."""
+        if self.said is not None:
+            likely: Int = most_probable_of_each(self.said["class_probability"])
+            return likely
+        classes: Int = scene.object_class[self.fused.row_object_ix].astype(np.int64)
+        return classes
+
+    def listed(self, frame: int) -> list[int]:
+        """Rows of `fused` that are in one list."""
+        order, bounds = self.fused.by_frame
+        rows = order[bounds[frame] : bounds[frame + 1]]
+        result: list[int] = rows[self.fused.valid[0, rows]].tolist()
+        return result
+
+
+@nb.njit(cache=True, nogil=True)
+def _newest(valid: Bool, captured_s: Float, entries: Int, start: Int, out: Float) -> None:
+    for s in range(out.shape[0]):
+        for p in range(out.shape[1]):
+            for c in range(start[p], start[p + 1]):
+                if valid[s, entries[c]]:
+                    out[s, p] = max(out[s, p], captured_s[entries[c]])
+
+
+@nb.njit(cache=True, nogil=True)
+def _first_unit(valid: Bool, arrives_s: Float, unit_ix: Int, entries: Int, start: Int, out: Int) -> None:
+    for s in range(out.shape[0]):
+        for p in range(out.shape[1]):
+            best = np.inf
+            for c in range(start[p], start[p + 1]):
+                r = entries[c]
+                # Entries are in the order of units: of those that arrive together (within 1 µs) the first stays.
+                if valid[s, r] and arrives_s[r] < best - 1e-6:
+                    best, out[s, p] = arrives_s[r], unit_ix[r]

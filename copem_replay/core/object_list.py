@@ -1,0 +1,86 @@
+"""Object lists without truth: what a fusion sees, and what it gives.
+
+An *entry* is one object in one list, as a receiver has it: never with a truth id. Lists are NumPy arrays of the record
+type `ENTRY`, so `entries["x_m"]` is a column and `entries[mask]` a shorter list. Letters: S runs, F lists of units,
+K instants at which the receiver issues a fused list, U units, N entries of all lists together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.tracks import CLASSES, Float, Int
+
+ENTRY = np.dtype(
+    [
+        ("x_m", "f8"),  # centre of the box, east, in the log's world frame
+        ("y_m", "f8"),
+        ("z_m", "f8"),
+        ("yaw_rad", "f8"),
+        ("vx_mps", "f8"),
+        ("vy_mps", "f8"),
+        ("length_m", "f8"),
+        ("width_m", "f8"),
+        ("height_m", "f8"),
+        ("cov_ee_m2", "f8"),  # position covariance, easting and northing: positive definite
+        ("cov_en_m2", "f8"),
+        ("cov_nn_m2", "f8"),
+        ("existence", "f8"),  # probability that there is an object, as whoever lists it claims
+        ("class_probability", "f8", (len(CLASSES),)),  # by index into CLASSES
+        ("captured_s", "f8"),  # in a unit's list: the list's; in a fused one: the newest that contributed
+        ("unit_ix", "i8"),  # in a unit's list: whose; in a fused one: of those that contributed the first, −1: not said
+        ("track_id", "i8"),  # as whoever lists it keeps tracks, −1: keeps none
+    ]
+)
+"""One entry of an object list."""
+
+COVARIANCES = ("cov_ee_m2", "cov_en_m2", "cov_nn_m2")
+
+Entries = NDArray[Any]
+"""(N,) of ENTRY."""
+
+
+def entries_of(count: int) -> Entries:
+    """A list of `count` entries with nothing in them: zeros, no unit, no track."""
+    entries = np.zeros(count, dtype=ENTRY)
+    entries["unit_ix"] = entries["track_id"] = -1
+    return entries
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Lists of S runs: list k of run s is `entries[start[s, k] : start[s, k + 1]]`, in no order that means anything.
+
+    `start (S, K + 1)`, `entries (N,)`.
+    """
+
+    start: Int
+    entries: Entries
+
+    def of(self, run: int, number: int) -> Entries:
+        """One list."""
+        one: Entries = self.entries[self.start[run, number] : self.start[run, number + 1]]
+        return one
+
+
+@dataclass(frozen=True)
+class Reports:
+    """All lists of all units, when the receiver has each, and the instants at which it issues a fused list.
+
+    List f is the same capture of the same unit in all runs; what is in it differs from run to run. Entries of one list
+    are in a random order that is the same however the recording was ordered.
+    """
+
+    units: tuple[str, ...]  # U
+    unit_ix: Int  # (F,) whose list
+    captured_s: Float  # (F,)
+    arrives_s: Float  # (F,) inf: never
+    lists: Lists  # of the units: F lists in each of S runs
+    issue_s: Float  # (K,) ascending
+    newest: Int  # (K, U) each unit's newest list that has arrived and is not too old; −1: none
+    arrived: Int  # (A,) lists in order of arrival; lists that never arrive are not among them
+    arrived_start: Int  # (K + 1,) `arrived[arrived_start[k] : arrived_start[k + 1]]` arrive at instant k

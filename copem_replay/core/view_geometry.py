@@ -1,0 +1,54 @@
+"""What passes between the engine and the models of a PEM."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.tracks import Float, Int
+
+Noise = Callable[[str], Float]
+"""`noise(name)` → (S, P) standard normals, addressed: the same name gives the same numbers."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How each candidate row looks from its unit. All (P,); nothing here depends on the run."""
+
+    range_m: Float  # horizontal, from the unit's place to the centre of the box
+    azimuth_rad: Float  # to the centre of the box, from the unit's heading, (−π, π]
+    bearing_rad: Float  # the same from east: the line of sight
+    visible_share: Float  # 0 … 1
+    class_ix: NDArray[np.int8]  # index into CLASSES
+    length_m: Float
+    width_m: Float
+    height_m: Float
+    yaw_rad: Float
+    speed_mps: Float
+
+    def take(self, rows: Int) -> Look:
+        """The look of some rows."""
+        return Look(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What an error model adds to the true state. Offsets (S, P), variances (P,); None: exact.
+
+    Position in easting and northing. Size is one offset for each of length, width and height: (3, S, P).
+    """
+
+    east_m: Float
+    north_m: Float
+    cov_ee_m2: Float
+    cov_en_m2: Float
+    cov_nn_m2: Float
+    yaw_rad: Float | None = None
+    yaw_var_rad2: Float | None = None
+    size_m: Float | None = None
+    size_var_m2: Float | None = None
+    speed_mps: Float | None = None
+    speed_var_m2ps2: Float | None = None

@@ -1,0 +1,201 @@
+"""What an experiment file names and does not have, and what in it does not go together: seen without any log.
+
+Checked on the file's plain data, so that a typo elsewhere does not hide it.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+from copem_replay.core.yaml import Key
+from copem_replay.experiment.file import Source
+from copem_replay.metrics.config import LONGEST_CHAIN
+
+NO_EGO = "none"
+"""`ego: none`: no ego in this study."""
+
+
+def references(source: Source) -> Iterator[str]:
+    """Names that nothing bears: PEMs, units, ids of units in latencies and in `distance_to`; a run that is not made."""
+    data = source.data
+    pems, units = _names(data.get("pems")), _names(data.get("units"))
+    for name, unit in _items(data.get("units")):
+        pem = unit.get("pem")
+        if _is_name(pem) and str(pem) not in pems:
+            yield source.at(("units", name, "pem"), unknown("PEM", pem, pems))
+    for name, configuration in _items(data.get("configurations")):
+        yield from _configuration(source, ("configurations", name), configuration, units)
+    measure = data.get("measure")
+    if isinstance(measure, dict):
+        place = measure.get("distance_to", "ego")
+        unit = dict(_items(data.get("units"))).get(str(place), {})
+        if place != "ego" and unit.get("recorded") is not None and unit.get("at") is None and unit.get("on") is None:
+            yield source.at(
+                ("measure", "distance_to"), f"unit {place!r} has no place; say `at: [x, y]` or `on: <object id>` of it"
+            )
+        if _is_name(place) and place != "ego" and str(place) not in units:
+            yield source.at(("measure", "distance_to"), unknown("unit", place, ["ego", *units]))
+        onset = measure.get("onset")
+        if isinstance(onset, dict) and onset.get("kind") == "line_of_sight_any" and not _modelled(data):
+            yield source.at(("measure", "onset"), "line_of_sight_any: there is no unit to see anything")
+    yield from _braking(source, data)
+    yield from _carried(source, data)
+    yield from _sweep(source, data, units)
+    show, runs = data.get("show"), data.get("runs", 1)
+    configurations = _names(data.get("configurations"))
+    chosen = show.get("configurations") if isinstance(show, dict) else None
+    for k, name in enumerate(chosen if isinstance(chosen, list) else []):
+        if _is_name(name) and str(name) not in configurations:
+            yield source.at(("show", "configurations", k), unknown("configuration", name, configurations))
+    run = show.get("run") if isinstance(show, dict) else None
+    several = enumerate(run) if isinstance(run, list) else ()
+    places: list[tuple[Key, object]] = [(("show", "run", k), one) for k, one in several] or [(("show", "run"), run)]
+    for key, one in places:
+        if type(one) is int and isinstance(runs, int) and 1 <= runs <= one:
+            yield source.at(key, f"expected a run below {runs}, found {one}")
+
+
+def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
+    """What braking and exact times need, and what they do not go with."""
+    braking, measure = data.get("braking"), data.get("measure")
+    measure = measure if isinstance(measure, dict) else {}
+    confirm = measure.get("confirm")
+    if measure.get("exact") is True:
+        match = measure.get("match")
+        if isinstance(match, dict) and match.get("always") is True:
+            yield source.at(("measure", "exact"), "matches depend on sampled errors and have no closed form")
+        recorded = [name for name, unit in _items(data.get("units")) if unit.get("recorded") is not None]
+        if recorded:
+            yield source.at(
+                ("measure", "exact"), f"unit {recorded[0]!r} is recorded: nothing says how probable its lists were"
+            )
+    if measure.get("exact") is True and isinstance(confirm, dict):
+        of = confirm.get("of", 1)
+        if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
+            message = f"for `exact` expected at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
+            yield source.at(("measure", "confirm", "of"), message)
+    if data.get("ego") == NO_EGO:
+        for key in (("braking",), ("measure", "conflict")):
+            if (braking if key[0] == "braking" else measure.get("conflict")) is not None:
+                yield source.at(key, "there is no ego in this study (`ego: none`) to brake or collide")
+    if not isinstance(braking, dict) or braking.get("brakes_for") != "conflict":
+        return
+    if measure.get("conflict") is None:
+        yield source.at(
+            ("braking", "brakes_for"),
+            "`conflict` needs `measure.conflict`, such as `conflict: {horizon_s: 3}`",
+        )
+    if measure.get("exact") is True:
+        yield source.at(
+            ("measure", "exact"),
+            "perceived conflicts depend on sampled errors and have no closed form; use `brakes_for: object`",
+        )
+
+
+def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
+    """What units that only some runs have do not go with."""
+    measure = data.get("measure")
+    measure = measure if isinstance(measure, dict) else {}
+    hits = measure["confirm"].get("hits", 1) if isinstance(measure.get("confirm"), dict) else 1
+    for name, unit in _items(data.get("units")):
+        if not isinstance(unit.get("on"), dict):
+            continue
+        if measure.get("distance_to") == name:
+            yield source.at(
+                ("measure", "distance_to"), f"unit {name!r} is carried by several objects; name a single one"
+            )
+        if isinstance(hits, int) and hits > 1 and measure.get("exact") is True:
+            yield source.at(
+                ("measure", "exact"),
+                f"unit {name!r} is only in some runs, and confirmation by several hits then has no closed "
+                "form; confirm with one hit",
+            )
+
+
+def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+    """Names and numbers of a sweep that there are not."""
+    sweep = data.get("sweep")
+    if not isinstance(sweep, dict):
+        return
+    named, configurations = sweep.get("configurations"), _names(data.get("configurations"))
+    by_quantity = named.items() if isinstance(named, dict) else [(None, named)]
+    for quantity, names in by_quantity:
+        where: Key = ("sweep", "configurations", *([] if quantity is None else [quantity]))
+        for k, name in enumerate(names if isinstance(names, list) else []):
+            if _is_name(name) and str(name) not in configurations:
+                yield source.at((*where, k), unknown("configuration", name, configurations))
+    carried = [name for name, unit in _items(data.get("units")) if isinstance(unit.get("on"), dict)]
+    if sweep.get("share") and not carried:
+        yield source.at(("sweep", "share"), "no unit is `on: {classes, share}`")
+    if sweep.get("rate_hz") and not units:
+        yield source.at(("sweep", "rate_hz"), "the experiment has no units")
+    others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
+    counts = sweep.get("units")
+    for k, count in enumerate(counts if isinstance(counts, list) else []):
+        if isinstance(count, int) and count > others:
+            yield source.at(
+                ("sweep", "units", k), f"expected at most {others}, the units beside the ego's; found {count}"
+            )
+
+
+def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+    chosen = configuration.get("units")
+    if chosen == "all" and not _modelled(source.data):
+        which = "modelled units; recorded ones are named" if units else "units"
+        yield source.at((*key, "units"), f"all: the experiment has no {which}")
+    yield from _fusion(source, key, configuration, chosen)
+    given: list[str] = []
+    for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
+        if _is_name(unit) and str(unit) not in units:
+            yield source.at((*key, "units", k), unknown("unit", unit, units))
+        elif str(unit) in given:
+            yield source.at((*key, "units", k), f"unit {str(unit)!r} named twice")
+        given.append(str(unit))
+    latency = configuration.get("latency_s")
+    for unit in latency if isinstance(latency, dict) else ():
+        if unit not in [*units, "default", "truth"]:
+            yield source.at((*key, "latency_s", unit), unknown("unit", unit, [*units, "default"]))
+
+
+def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: object) -> Iterator[str]:
+    """What fusions other than the ideal one do not go with."""
+    fusion, measure = configuration.get("fusion"), source.data.get("measure")
+    kind = fusion.get("kind") if isinstance(fusion, dict) else None
+    if not isinstance(kind, str) or kind == "ideal":
+        return
+    if chosen == "truth":
+        yield source.at((*key, "fusion"), f"the truth is not fused; {kind} needs units")
+    if isinstance(measure, dict) and measure.get("exact") is True:
+        yield source.at(
+            ("measure", "exact"),
+            f"configuration {key[-1]!r}: {kind} has no exact times, as what it does depends on sampled errors; only "
+            "ideal fusion has",
+        )
+
+
+def _modelled(data: dict[str, Any]) -> list[str]:
+    return [name for name, unit in _items(data.get("units")) if unit.get("recorded") is None]
+
+
+def _items(mapping: object) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, value in mapping.items() if isinstance(mapping, dict) else ():
+        if isinstance(value, dict):
+            yield name, value
+
+
+def _names(mapping: object) -> list[str]:
+    return [str(name) for name in mapping] if isinstance(mapping, dict) else []
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str | int) and not isinstance(value, bool)
+
+
+def unknown(what: str, name: object, known: Iterable[str]) -> str:
+    """That nothing bears a name, and which there are, or which was meant."""
+    names = list(dict.fromkeys(known))
+    near = difflib.get_close_matches(str(name), names, n=1)
+    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"
+    return f"no {what} is named {str(name)!r}{hint}"

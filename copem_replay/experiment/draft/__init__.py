@@ -1,0 +1,1 @@
+"""An experiment drafted from a recording."""

@@ -1,0 +1,71 @@
+"""What channels of unknown schemas could be read as: `read:` of an experiment, proposed and tried."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic import ValidationError
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.experiment.draft.field_guess import propose, stamp_paths
+from copem_replay.io.encodings.columns import take_apart
+from copem_replay.io.encodings.raw_values import DefinitionError
+from copem_replay.io.log import BrokenIndexError, Channel, Log
+from copem_replay.io.recording import Recording, foreign, read_log
+from copem_replay.io.schemas.description import Fields
+from copem_replay.io.schemas.poses import is_pose
+from copem_replay.io.schemas.registry import definition_of, is_list
+
+_CHANNELS = 30
+"""So many channels of a recording are looked at (chosen)."""
+_SAMPLES = 50
+"""So many messages of each (chosen)."""
+_OFFERS = 40
+"""So many fields are named where not all were found (chosen)."""
+
+
+def proposals(log: Log, name: str) -> Iterator[tuple[dict[str, Any], Recording | None]]:
+    """Of each channel that looks like a list of objects: plain data, and what it is read as, None where it is not.
+
+    `read`: as the experiment has it, of what was found; `missing`: needed keys that were not; `others`: for some keys
+    what else could be meant; `offers`: fields there are; `problem`: why it was not read.
+    """
+    unknown = [c for c in foreign(log) if not is_list(c) and not is_pose(c)]
+    for channel in unknown[:_CHANNELS]:
+        try:
+            found = _proposed(log, channel)
+        except (DefinitionError, BrokenIndexError, RecordingError):
+            continue
+        if found is None:
+            continue
+        recording, problem = None, None
+        if not found["missing"]:
+            try:
+                fields = Fields.model_validate({key: v for key, v in found["read"].items() if key != "topic"})
+                recording = read_log(log, name=name, topic=channel.topic, fields=fields)
+            except (RecordingError, BrokenIndexError, ValidationError) as error:
+                problem = str(error).removeprefix(f"{log.path}: ")
+        yield found | {"problem": problem}, recording
+
+
+def _proposed(log: Log, channel: Channel) -> dict[str, Any] | None:
+    samples = list(itertools.islice(log.payloads(frozenset({channel.number})), _SAMPLES))
+    payloads, times = [data for _, _, data in samples], [at for _, at, _ in samples]
+    definition = definition_of(channel, payloads)
+    offers = definition.offers()
+    paths = stamp_paths(offers)
+    said = take_apart(definition, payloads, texts=paths).levels[""]
+    words = {p: [said.texts[p].words[k] if k >= 0 else "" for k in said.texts[p].code] for p in paths}
+    found = propose(offers, words, [times[m] for m in said.parent])
+    if found is None:
+        return None
+    return {
+        "topic": channel.topic,
+        "schema": channel.schema,
+        "read": {"topic": channel.topic, **found.read},
+        "missing": list(found.missing),
+        "others": {key: list(paths) for key, paths in found.others.items()},
+        "offers": list(offers)[:_OFFERS],
+    }

@@ -1,0 +1,381 @@
+"""The experiment: what is replayed through what, and what is measured. Frozen models, defaults that run.
+
+Key names are the contract's; units are in the names. Cross-references (a unit's `pem`, a configuration's `units`)
+are checked in `experiment/validate.py`, which reports all problems of a file at once.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from copem_replay.core.components import Count, Frozen, Id, NotNegative, Number, Positive, Share, Slot
+from copem_replay.fusion import FUSIONS
+from copem_replay.fusion.base import Fusion, Ideal
+from copem_replay.io.schemas.object_lists import Fields
+from copem_replay.metrics.braking.driver import DRIVERS, Driver
+from copem_replay.metrics.config import Margin, Measure
+from copem_replay.perception.pem.condition import ClassNames, Pem
+from copem_replay.perception.pem.error import Covariance
+
+
+def _unit_name(value: str) -> str:
+    if value in ("default", "truth", "all", ""):
+        raise ValueError(f"{value!r} cannot be a unit's name")
+    return value
+
+
+def _of_64_bits(value: int) -> int:
+    if not -(2**63) <= value < 2**64:
+        raise ValueError(f"expected a whole number of 64 bits (-2^63 … 2^64 - 1), found {value}")
+    return value
+
+
+def _version(value: object) -> object:
+    if isinstance(value, bool):  # equals 1 to Python
+        raise ValueError(f"expected 1, found {str(value).lower()}")
+    return value
+
+
+def _configuration_name(value: str) -> str:
+    # The name is part of topics and of entity paths.
+    if not value or "/" in value or not value.isprintable():
+        raise ValueError(f"expected a printable name without '/', found {value!r}")
+    return value
+
+
+UnitName = Annotated[Id, AfterValidator(_unit_name)]
+ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
+Point = tuple[Number, Number]
+
+
+def _two(value: object) -> object:
+    if isinstance(value, list | tuple) and len(value) == 3:
+        found = ", ".join(str(number) for number in value)
+        raise ValueError(f"expected two numbers, in the plane, found [{found}]; the height above ground is `height_m`")
+    return value
+
+
+InPlane = Annotated[Point, BeforeValidator(_two)]
+"""A point beside which a height may stand."""
+
+
+Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
+"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
+
+
+Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
+"""Lists per second."""
+
+
+class Carriers(Frozen):
+    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability `share`."""
+
+    classes: ClassNames
+    share: Share
+
+
+def _what_carries(value: object) -> str:
+    return "carriers" if isinstance(value, dict | Carriers) else "id"
+
+
+On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], Discriminator(_what_carries)]
+
+
+class Recorded(Frozen):
+    """Lists as they were recorded in the log, on a topic of osi3.SensorData, instead of a PEM.
+
+    `delay_s`: how long before its stamp a list was captured, where its messages don't say; `covariance_m2` of its
+    positions and `existence` of its entries likewise.
+    """
+
+    topic: Annotated[str, Field(min_length=1)]
+    delay_s: Latency = 0.0
+    covariance_m2: Covariance | None = None
+    existence: Share = 0.9
+
+
+class Unit(Frozen):
+    """A perception unit: carried `on` the ego, another object or a share of some classes, or standing `at` a place.
+
+    `height_m` above the ground; left out, a carried unit is on the roof. One whose lists are `recorded` has no PEM, and
+    needs a place only where distances are measured from it.
+    """
+
+    on: On | None = None
+    at: InPlane | None = None
+    offset_m: InPlane = (0.0, 0.0)
+    yaw_deg: Number = 0.0
+    height_m: NotNegative | None = None
+    ground_z_m: Number | None = None
+    pem: Id | None = None
+    recorded: Recorded | None = None
+    rate_hz: Rate | None = None
+    phase_s: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _place(self) -> Self:
+        if (self.pem is None) == (self.recorded is None):
+            raise ValueError("expected one of `pem: <name>` and `recorded: {topic: …}`")
+        if self.recorded is not None:
+            if self.rate_hz is not None or isinstance(self.on, Carriers) or (self.on and self.at):
+                raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
+            return self
+        if (self.on is None) == (self.at is None):
+            raise ValueError("expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`")
+        if self.height_m is None and self.at is not None:
+            raise ValueError("height_m: needed for a unit `at` a place; only a carried one is on a roof by default")
+        if self.ground_z_m is not None and self.at is None:
+            raise ValueError("ground_z_m: only for a unit `at` a place; a carrier brings its own ground")
+        if self.phase_s and self.rate_hz is None:
+            raise ValueError("phase_s: needs rate_hz (without it there is one list per frame of the truth)")
+        return self
+
+
+_AROUND = "the corners in order around an area, each once"
+
+
+def _crooked(reason: str) -> str:
+    """What is wrong with a polygon, of which shapely says `Self-intersection[5 5]`."""
+    what, _, place = reason.rstrip("]").partition("[")
+    at = f" at [{', '.join(place.split())}]" if place else ""
+    words = {"Self-intersection": f"edges that cross or overlap{at}", "Ring Self-intersection": f"edges that meet{at}"}
+    return words.get(what, "corners without an area between them")
+
+
+class Obstacle(Frozen):
+    """A static obstacle beside those in the log."""
+
+    polygon_m: Annotated[tuple[Point, ...], Field(min_length=3)]
+    height_m: Positive
+    ground_z_m: Number | None = None
+
+    @model_validator(mode="after")
+    def _simple(self) -> Self:
+        import shapely
+
+        polygon = shapely.Polygon(self.polygon_m)
+        if not polygon.is_valid or polygon.area <= 0:
+            raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
+        return self
+
+
+class Configuration(Frozen):
+    """What is compared: which units, which fusion, which latency."""
+
+    units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
+    fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
+    latency_s: Latency | dict[Id, Latency] = 0.0
+    max_age_s: Positive = 1.0
+
+    def latency_of(self, unit: str) -> float:
+        """Seconds from capture to arrival of a unit's lists."""
+        if isinstance(self.latency_s, dict):
+            return self.latency_s.get(unit, self.latency_s.get("default", 0.0))
+        return self.latency_s
+
+
+class Braking(Frozen):
+    """What the ego's declared driver does when an object is known (`brakes_for: object`) or seen to be in its way.
+
+    `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (whoever was recorded may
+    have braked already).
+    """
+
+    driver: Annotated[Driver, Slot("driver", DRIVERS)]
+    margin_m: Margin = 0.5
+    ego: Literal["recorded", "constant_speed"] = "recorded"
+    brakes_for: Literal["object", "conflict"] = "object"
+
+
+def _how_many(value: object) -> object:
+    if isinstance(value, str | list | tuple):
+        raise ValueError(f"expected how many units beside the ego's, such as 2 (a count, no names), found {value!r}")
+    return value
+
+
+Units = Annotated[int, Field(strict=True, ge=0, le=10**6), BeforeValidator(_how_many)]
+
+
+def _once(values: tuple[float, ...]) -> tuple[float, ...]:
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            raise ValueError(f"expected each value once, found {value:g} twice")
+    return values
+
+
+SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
+
+
+class SweptBy(Frozen):
+    """Which configurations each quantity changes, where not all change the same ones."""
+
+    latency_s: SweptNames | None = None
+    rate_hz: SweptNames | None = None
+    units: SweptNames | None = None
+    share: SweptNames | None = None
+
+
+def _swept_by(value: object) -> str:
+    return "by" if isinstance(value, dict | SweptBy) else "names"
+
+
+Swept = Annotated[Annotated[SweptNames, Tag("names")] | Annotated[SweptBy, Tag("by")], Discriminator(_swept_by)]
+
+
+class Sweep(Frozen):
+    """Values of one quantity at a time at which `configurations` are run, too: names, or names by quantity.
+
+    By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
+    `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
+    `units`: how many of a configuration's units beside the ego's, the first ones. `share`: of those who carry a unit.
+    """
+
+    configurations: Swept | None = None
+    latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    share: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not (self.latency_s or self.rate_hz or self.units or self.share):
+            raise ValueError("expected values of latency_s, rate_hz, units or share, such as `latency_s: [0, 0.5, 1]`")
+        for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
+            if self.chosen(quantity) and not getattr(self, quantity):
+                raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")
+        return self
+
+    def chosen(self, quantity: str) -> tuple[str, ...] | None:
+        """The configurations that a quantity shall change; None: nothing is said of it."""
+        if not isinstance(self.configurations, SweptBy):
+            return self.configurations
+        chosen: tuple[str, ...] | None = getattr(self.configurations, quantity)
+        return chosen
+
+
+class Read(Frozen):
+    """How the truth is found in a recording that holds several object lists."""
+
+    topic: str | None = None
+
+
+class ReadFields(Fields):
+    """How the truth is read from a topic of a schema that is not known by name: which of its fields are what."""
+
+    topic: Annotated[str, Field(min_length=1)]
+
+
+def _how_read(value: object) -> str:
+    named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
+    return "fields" if named else "topic"
+
+
+HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
+
+
+class EgoTopic(Frozen):
+    """An ego that is no object of any list: its poses are on a topic (odometry, stamped poses, transforms).
+
+    `size_m`: length, width, height. `centre_from_rear_axle_m`: how far ahead of its poses, which are on the ground, the
+    centre of its box is. `frame`: whose poses, where the topic has those of several.
+    """
+
+    topic: Annotated[str, Field(min_length=1)]
+    size_m: tuple[Positive, Positive, Positive] | None = None
+    centre_from_rear_axle_m: Number | None = None
+    frame: str | None = None
+
+
+def _what_ego(value: object) -> str:
+    return "topic" if isinstance(value, dict | EgoTopic) else "id"
+
+
+Ego = Annotated[Annotated[Id, Tag("id")] | Annotated[EgoTopic, Tag("topic")], Discriminator(_what_ego)]
+
+
+WhichRun = Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst", "best"]
+
+
+def _each_once(runs: tuple[WhichRun, ...]) -> tuple[WhichRun, ...]:
+    twice = [run for k, run in enumerate(runs) if run in runs[:k]]
+    if twice:
+        raise ValueError(f"expected each run once, found {twice[0]} twice")
+    return runs
+
+
+class Show(Frozen):
+    """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
+
+    `run: null` writes none; `pipeline/selected_runs.py` says which run is `median`, `worst` or `best`.
+    """
+
+    logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
+    run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_each_once)] | None = 0
+    configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+
+    def asked(self) -> tuple[WhichRun, ...]:
+        """The runs, one or several or none, in their order."""
+        if isinstance(self.run, tuple):
+            return self.run
+        return () if self.run is None else (self.run,)
+
+
+def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
+    from_s, to_s = window_s
+    if from_s is not None and to_s is not None and from_s > to_s:
+        raise ValueError(f"expected [from, to], found one that ends ({to_s:g} s) before it begins ({from_s:g} s)")
+    return window_s
+
+
+class Experiment(Frozen):
+    """An experiment file.
+
+    `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
+    """
+
+    version: Annotated[Literal[1], BeforeValidator(_version)]
+    logs: Annotated[tuple[str, ...], Field(min_length=1)]
+    read: HowRead = Read()
+    ego: Ego | None = None
+    window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None
+    max_gap_s: Positive = 0.5
+    runs: Count = 1
+    seed: Annotated[int, Field(strict=True), AfterValidator(_of_64_bits)] = 0
+    pems: dict[Id, Pem] = Field(default_factory=dict)
+    units: dict[UnitName, Unit] = Field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] = ()
+    visibility: Literal["surface", "flat"] = "surface"
+    configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]
+    measure: Measure = Measure()
+    braking: Braking | None = None
+    sweep: Sweep | None = None
+    show: Show | None = Show()
+
+    @property
+    def modelled(self) -> dict[str, Unit]:
+        """The units that have a PEM."""
+        return {name: unit for name, unit in self.units.items() if unit.recorded is None}
+
+    @property
+    def recorded(self) -> dict[str, Recorded]:
+        """The units whose lists are recorded in the log."""
+        return {name: unit.recorded for name, unit in self.units.items() if unit.recorded is not None}
+
+    def units_of(self, configuration: Configuration) -> tuple[str, ...]:
+        """Names of the units of a configuration, in the experiment's order; none for the truth."""
+        if configuration.units == "truth":
+            return ()
+        if configuration.units == "all":
+            return tuple(self.modelled)
+        return tuple(name for name in self.units if name in configuration.units)
+
+    def shown(self) -> dict[str, Configuration]:
+        """The configurations that are written to MCAP and .rrd."""
+        wanted = self.show.configurations if self.show is not None else None
+        return {name: c for name, c in self.configurations.items() if wanted is None or name in wanted}
+
+    def as_written(self) -> dict[str, Any]:
+        """The experiment with every default filled in, as plain data for YAML."""
+        return self.model_dump(mode="json", by_alias=True)

@@ -1,0 +1,202 @@
+"""Everything that can be wrong with an experiment beyond the shape of its file: references, and the logs it names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from copem_replay.core.errors import EmptyWindowError, RecordingError
+from copem_replay.core.yaml import Key
+from copem_replay.experiment.cross_references import NO_EGO, references, unknown
+from copem_replay.experiment.file import Source, is_there, log_paths, named_paths, parse
+from copem_replay.experiment.schema import Carriers, Experiment, ReadFields
+from copem_replay.io.log import name_of
+from copem_replay.io.recorded_units import recorded_unit
+from copem_replay.io.recording import Recording, moving_ids, read
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A log that cannot be replayed, and why. `key`: what the experiment asks of it in vain."""
+
+    path: Path
+    reason: str
+    key: Key | None = None
+
+    def said(self, source: Source | None) -> str:
+        """The reason as a line: where it is, and what is wrong."""
+        line = f"{self.path}: {self.reason}"
+        return line if self.key is None or source is None else source.at(self.key, line)
+
+
+def problems(source: Source) -> tuple[Experiment | None, list[str]]:
+    """The experiment, or None where its shape is wrong, and all problems that show without a look at the logs."""
+    experiment, found = parse(source)
+    found += references(source)
+    found += log_paths(source)[1]
+    return experiment, sorted(found, key=lambda line: _line_number(line, source.path))
+
+
+def _line_number(problem: str, path: Path) -> int:
+    number = problem.removeprefix(f"{path}:").partition(":")[0]
+    return int(number) if number.isdigit() else 0
+
+
+def place_of(path: Path) -> Path:
+    """Where a file is, whatever led there; its own name is kept, even if it is a link's."""
+    if path.name in ("", ".."):  # folders that are named by where we are
+        return Path(os.path.realpath(path))
+    return Path(os.path.realpath(path.parent)) / path.name
+
+
+def log_names(paths: Sequence[Path]) -> list[str]:
+    """A name per log: the name of its file or folder, made unique by its folder where two are alike."""
+    whole = [place_of(path).relative_to("/") for path in paths]
+    bare = [path.parent / name_of(Path("/", path)) for path in whole]
+    bare = [short if bare.count(short) == 1 else path for short, path in zip(bare, whole, strict=True)]
+    depth = [1] * len(paths)
+    while True:
+        names = ["/".join(path.parts[-d:]) for path, d in zip(bare, depth, strict=True)]
+        again = [names.count(name) > 1 and d < len(p.parts) for name, p, d in zip(names, bare, depth, strict=True)]
+        if not any(again):
+            return names
+        depth = [d + twice for d, twice in zip(depth, again, strict=True)]
+
+
+def read_logs(
+    experiment: Experiment, paths: Mapping[Path, Key | None] | Iterable[Path], source: Source | None
+) -> tuple[list[Recording], list[Refused]]:
+    """The recordings that can be replayed, and what is wrong with those that cannot.
+
+    `paths`: with where the experiment names each. A file that is named twice is read once.
+    """
+    keys = paths if isinstance(paths, Mapping) else dict.fromkeys(paths)
+    recordings: dict[str, Recording] = {}
+    refused: list[Refused] = []
+    names_of = _named(source) if source is not None and isinstance(paths, Mapping) else {}
+    for path, key in keys.items():
+        if not is_there(path):
+            refused.append(Refused(path, "no such file", key))
+        elif (place := os.path.realpath(path)) not in recordings:
+            recording, wrong = _read(experiment, path)
+            refused += wrong
+            if recording is not None and not wrong:
+                again = names_of.get(place, [])
+                said = [f"named more than once ({', '.join(again)}): replayed once"] if len(again) > 1 else []
+                recordings[place] = replace(recording, notes=(*said, *recording.notes))
+    # Named when it is known which there are: the experiment that is written with the results names only these.
+    names = log_names([recording.path for recording in recordings.values()])
+    return [replace(r, scene=replace(r.scene, log=n)) for r, n in zip(recordings.values(), names, strict=True)], refused
+
+
+def _named(source: Source) -> dict[str, list[str]]:
+    """By what each file is named in an experiment, or by options: `logs[0]`, `--log`."""
+    names: dict[str, list[str]] = {}
+    for name, path in named_paths(source):
+        if is_there(path):
+            names.setdefault(os.path.realpath(path), []).append(name)
+    return names
+
+
+def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Refused]]:
+    try:
+        str(place_of(path)).encode()
+    except UnicodeEncodeError:
+        return None, [Refused(path, "its path is not UTF-8: results could not name it")]
+    ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
+    wrong: list[Refused] = []
+    fields = experiment.read if isinstance(experiment.read, ReadFields) else None
+    beside = {asked.topic for asked in experiment.recorded.values()}
+    how = partial(
+        read, path, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside,
+        window_s=experiment.window_s,
+    )  # fmt: skip
+    try:
+        recording = how(ego=ego)
+    except EmptyWindowError as error:
+        return None, [Refused(path, line.removeprefix(f"{path}: "), ("window_s",)) for line in error.problems]
+    except RecordingError as error:
+        reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
+        if not reasons[0].startswith("ego: "):
+            key = ("read", "topic") if "no true objects on topic" in reasons[0] else None
+            return None, [Refused(path, reason, key) for reason in reasons]
+        wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
+        recording = how()  # for what else is wrong
+    if experiment.ego == NO_EGO:
+        recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
+    lists, notes = {}, list(recording.notes)
+    for name, asked in experiment.recorded.items():
+        try:
+            lists[name], said = recorded_unit(recording, name, asked)
+            notes += said
+        except RecordingError as error:
+            at = ("units", name, "recorded")
+            wrong += [Refused(path, line.removeprefix(f"{path}: "), at) for line in error.problems]
+    recording = replace(recording, lists=lists, notes=tuple(notes))
+    return recording, wrong + [Refused(path, reason, key) for key, reason in against_log(experiment, recording, wrong)]
+
+
+def against_log(
+    experiment: Experiment, recording: Recording, known: Sequence[Refused] = ()
+) -> Iterator[tuple[Key, str]]:
+    """Problems of an experiment with one log, beside `known` ones: no ego, carriers that are not in it."""
+    scene = recording.scene
+    none = scene.ego_ix < 0
+    if none and experiment.ego is None:
+        yield (
+            ("ego",),
+            f"no ego vehicle in this log{_host(recording)}; give `ego: <object id>` or --ego ID "
+            f"({moving_ids(scene)}), or `ego: none` with `distance_to: <unit>`",
+        )
+    if experiment.braking is not None and not none and not scene.ego_sized:
+        yield ("braking",), "nobody says how large the ego is; give `ego: {topic: …, size_m: [length, width, height]}`"
+    studied = not none or experiment.ego != NO_EGO  # an ego that is sought and not there is said once
+    if not studied and experiment.measure.distance_to == "ego":
+        yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"
+    for name, unit in experiment.units.items():
+        if unit.on == "ego":
+            if not studied:
+                yield ("units", name, "on"), "no ego in this study to carry the unit"
+        elif isinstance(unit.on, Carriers):
+            taken = [one for one in scene.object_ids if f"{name}:{one}" in experiment.units]
+            if taken:
+                yield ("units", f"{name}:{taken[0]}"), f"that is what {name} is called on object {taken[0]}"
+        elif unit.on is not None and unit.on not in scene.object_number:
+            yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
+    if experiment.measure.onset.kind != "line_of_sight" or known:
+        return
+    if not studied:
+        yield ("measure", "onset"), "line_of_sight is the ego's; without an ego use line_of_sight_any"
+    elif not none:
+        on_ego = ("ego", scene.object_ids[scene.ego_ix])
+        if not any(unit.on in on_ego for unit in experiment.units.values()):
+            yield ("measure", "onset"), "line_of_sight needs a unit on the ego; or use line_of_sight_any"
+
+
+def across_logs(experiment: Experiment, recordings: Sequence[Recording], source: Source | None) -> Iterator[str]:
+    """Problems with all logs together: measured ids that are in none of them, shown logs that do not exist."""
+
+    def at(key: Key, message: str) -> str:
+        return source.at(key, message) if source else message
+
+    scenes = [recording.scene for recording in recordings]
+    for k, wanted in enumerate(experiment.measure.objects.ids or () if scenes else ()):
+        key = ("measure", "objects", "ids", k)
+        there = [scene for scene in scenes if wanted in scene.object_number]
+        if not there:
+            yield at(key, f"no object {wanted!r} in any log; the first has {moving_ids(scenes[0])}")
+        elif all(scene.object_number[wanted] == scene.ego_ix for scene in there):
+            yield at(key, f"{wanted!r} is the ego vehicle, which is not measured")
+    names = [scene.log for scene in scenes]
+    for k, wanted in enumerate(experiment.show.logs if experiment.show else ()):
+        if names and wanted not in ("first", "all", *names):
+            yield at(("show", "logs", k), unknown("log", wanted, ["first", "all", *names]))
+
+
+def _host(recording: Recording) -> str:
+    if recording.host_id is None:
+        return " (host_vehicle_id is not set)"
+    return f" (its host_vehicle_id {recording.host_id!r} is no moving object of it)"

@@ -1,0 +1,212 @@
+"""Fusion algorithms as components: all but the ideal one see lists without truth, and what has arrived only."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from copem_replay.core.components import Component, GivenError, asked, wrong
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
+from copem_replay.core.tracks import VALUES
+
+
+class Fusion(Component, ABC):
+    """Base of everything that `fusion:` may name."""
+
+
+class Ideal(Fusion):
+    """The paper's Ideal Fusion Model: matching by truth id, inverse-variance combination (fusion/ideal.py).
+
+    `combine: samples` weighs the units' sampled errors (draws stay common with other configurations),
+    `combine: posterior` draws once from N(μ, Σ); both have the same law.
+    """
+
+    kind: Literal["ideal"] = "ideal"
+    combine: Literal["samples", "posterior"] = "samples"
+
+
+class ListFusion(Fusion):
+    """Base of fusions that go by lists without truth."""
+
+    resumable: ClassVar[bool] = False
+    """Whether `resume` gives, stretch after stretch of the instants, the very lists of `fuse`; if not, all instants are
+    handed over at once. Whoever overrides `fuse` has to say so anew."""
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        if "fuse" in vars(cls) and "resumable" not in vars(cls):
+            cls.resumable = False
+
+    @property
+    def looks_back_s(self) -> float:
+        """Which lists that arrived before a stretch it needs once more, beside those in `newest`.
+
+        Those captured at most so long before the newest capture that had arrived by then: the others have no entries.
+        It is from that capture that it counts, not from the stretch's first instant, since all lists may come late.
+        """
+        return 0.0
+
+    @abstractmethod
+    def fuse(self, reports: Reports) -> Lists:
+        """One fused list per instant and run, `start (S, K + 1)`.
+
+        The list of instant k may depend on nothing that arrives later, nor on other runs, nor on the order of
+        entries or units. Of its entries `captured_s` is the newest capture that contributed, `unit_ix` the first unit
+        that did (−1: not said), `track_id` an identity over time (−1: the algorithm keeps none).
+        """
+
+    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+        """The lists of the next stretch of instants, and what is to be remembered for the one after it.
+
+        Stretches are consecutive, and lists of units have the same numbers in all. `memory`: what the last call gave,
+        None at first; each is handed over once. As it stands here a fusion without memory is resumed: the list of an
+        instant depends on the lists in `newest` and `arrived` alone.
+        """
+        return self.fuse(reports), None
+
+
+@dataclass(frozen=True)
+class UnitList:
+    """One list of one unit, its entries in no order that means anything."""
+
+    unit: str
+    captured_s: float
+    arrives_s: float
+    entries: Entries
+
+
+@dataclass(frozen=True)
+class Inbox:
+    """What the receiver has at an instant.
+
+    `newest`: each unit's newest list, if it is not older than `max_age_s` (in the order of the experiment's units).
+    `arrived`: the lists that arrive at this very instant, in order of capture; old ones that come late are among them.
+    """
+
+    newest: tuple[UnitList, ...]
+    arrived: tuple[UnitList, ...]
+
+
+class StepFusion(ListFusion):
+    """Base of fusions in plain Python: one instant at a time. Derive your own from this."""
+
+    resumable: ClassVar[bool] = True
+
+    @abstractmethod
+    def step(self, now_s: float, inbox: Inbox, memory: Any) -> tuple[Entries, Any]:
+        """The fused list of this instant, and what is to be remembered until the next (`memory`: None at first)."""
+
+    def fuse(self, reports: Reports) -> Lists:
+        """Every run by itself, instant after instant."""
+        return self.resume(reports, None)[0]
+
+    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+        """The same at the next instants. What is remembered is of each run what its last step gave."""
+        runs, instants = len(reports.lists.start), len(reports.issue_s)
+        start = np.zeros((runs, instants + 1), dtype=np.int64)
+        parts: list[Entries] = []
+        total = 0
+        memories = [None] * runs if memory is None else list(memory)
+        for s in range(runs):
+            start[s, 0] = total
+            for k in range(instants):
+                given = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memories[s])
+                if not isinstance(given, tuple) or len(given) != 2:
+                    raise GivenError("step", f"expected a list and a memory, found {type(given).__name__}")
+                entries, memories[s] = given
+                if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY or entries.ndim != 1:
+                    found = entries.dtype.name if isinstance(entries, np.ndarray) else type(entries).__name__
+                    raise GivenError("step", f"expected a list (an array of ENTRY) and a memory, found {found}")
+                parts.append(entries)
+                total += len(entries)
+                start[s, k + 1] = total
+        return Lists(start, np.concatenate([reports.lists.entries[:0], *parts])), memories
+
+
+def fused_by(fusion: ListFusion, reports: Reports, where: str) -> Lists:
+    """What a fusion gives, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
+    return _checked(asked(fusion, where, lambda: fusion.fuse(reports)), fusion, reports, where)
+
+
+def resumed_by(fusion: ListFusion, reports: Reports, memory: Any, where: str) -> tuple[Lists, Any]:
+    """What a `resumable` fusion gives of the next stretch and remembers, checked as `fused_by` does."""
+    given = asked(fusion, where, lambda: fusion.resume(reports, memory))
+    if said := pair_problem(given):
+        raise wrong(fusion, where, said, "resume")
+    found, memory = given
+    return _checked(found, fusion, reports, where), memory
+
+
+def _checked(found: Lists, fusion: ListFusion, reports: Reports, where: str) -> Lists:
+    said = form_problem(found, reports) or content_problem(found, reports)
+    if said is not None:
+        raise wrong(fusion, where, said, "step", "fuse", "resume")
+    return found
+
+
+def pair_problem(given: object) -> str | None:
+    """What is wrong with the form of what `resume` gave; None: it is two things."""
+    if isinstance(given, tuple) and len(given) == 2:
+        return None
+    return f"resume: expected Lists and a memory, found {type(given).__name__}"
+
+
+def form_problem(found: object, reports: Reports) -> str | None:
+    """What is wrong with the form of the lists a fusion gave; None: nothing."""
+    shape = (len(reports.lists.start), len(reports.issue_s) + 1)
+    if not isinstance(found, Lists):
+        return f"fuse: expected Lists, found {type(found).__name__}"
+    if found.start.shape != shape or found.entries.dtype != ENTRY:
+        return (
+            f"fuse: expected lists of ENTRY with start {shape}, found {found.entries.dtype.name} with start "
+            f"{found.start.shape}"
+        )
+    begin, end = np.append(found.start[:, 0], len(found.entries)), np.append(0, found.start[:, -1])
+    if found.start.dtype != np.int64 or (begin != end).any() or (np.diff(found.start) < 0).any():
+        said = f"expected start of whole numbers from 0 to {len(found.entries)}, list after list, run after run"
+        return f"{said}, found {found.start.tolist()}"
+    return None
+
+
+def content_problem(found: Lists, reports: Reports) -> str | None:
+    """What is wrong with the entries of lists of the right form; None: nothing."""
+    for name in (*VALUES, *COVARIANCES, "existence", "captured_s", "class_probability"):
+        if not np.isfinite(found.entries[name]).all():
+            return f"{name}: expected numbers, found NaN or infinity"
+    existence = found.entries["existence"]
+    if ((existence < -1e-9) | (existence > 1 + 1e-9)).any():
+        return f"existence: expected probabilities, found {existence.min():g} … {existence.max():g}"
+    ee, en, nn = (found.entries[name] for name in COVARIANCES)
+    if ((ee <= 0) | (nn <= 0) | (ee * nn - en * en <= 0)).any():
+        return "cov_*_m2: expected positive definite covariances"
+    now_s = np.repeat(np.tile(reports.issue_s, len(found.start)), np.diff(found.start, axis=1).ravel())
+    if (found.entries["captured_s"] > now_s + 1e-6).any():
+        return "captured_s: expected captures that are not in the future"
+    tracked = found.entries["track_id"] >= 0
+    of_list = np.repeat(np.arange(found.start[:, 1:].size), np.diff(found.start, axis=1).ravel())[tracked]
+    order = np.lexsort((found.entries["track_id"][tracked], of_list))
+    twice = np.diff(of_list[order]) == 0
+    if (twice & (np.diff(found.entries["track_id"][tracked][order]) == 0)).any():
+        return "track_id: expected each once in a list, found one twice (−1: no track is kept)"
+    unit_ix = found.entries["unit_ix"]
+    if ((unit_ix < -1) | (unit_ix >= len(reports.units))).any():
+        return f"unit_ix: expected −1 … {len(reports.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"
+    return None
+
+
+def inbox_at(reports: Reports, run: int, instant: int) -> Inbox:
+    """What the receiver has at one instant of one run."""
+
+    def one(f: int) -> UnitList:
+        entries = reports.lists.of(run, f).copy()  # whoever changes it changes his own
+        return UnitList(
+            reports.units[reports.unit_ix[f]], float(reports.captured_s[f]), float(reports.arrives_s[f]), entries
+        )
+
+    newest = [int(f) for f in reports.newest[instant] if f >= 0]
+    came = reports.arrived[reports.arrived_start[instant] : reports.arrived_start[instant + 1]]
+    in_order = came[np.lexsort((reports.unit_ix[came], reports.captured_s[came]))]
+    return Inbox(tuple(map(one, newest)), tuple(one(int(f)) for f in in_order))

@@ -1,0 +1,99 @@
+"""From tracks with truth ids to lists without: what a real fusion sees of what the units heard in each run.
+
+Nothing in a report tells which entries are of one object: the order within each list is drawn. The receiver's own body
+is left out, since it knows where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+
+from copem_replay.communication.arrivals import Instants, instants
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
+from copem_replay.core.tracks import VALUES, Bool, Float, Int, Tracks
+from copem_replay.fusion.ideal import floored
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What entries say beside their states, row by row. (P,), `class_probability (P, C)`."""
+
+    existence: Float
+    class_probability: Float
+    track_id: Int
+
+
+def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> Lists:
+    """The lists of all units in all runs, F in each of S. `drawn (S, P)`: by what entries of a list are ordered."""
+    kept = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
+    return gathered(heard, claims, drawn, kept)[0]
+
+
+def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[Lists, Int, Int]:
+    """Rows of `valid (S, P)` as lists, ordered by `drawn (S, P)`; and of which run and row each entry is, (N,) each."""
+    order, bounds = heard.by_frame
+    start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
+    picked = np.empty(int(valid.sum()), dtype=np.int64)
+    _pick(valid, drawn, order, bounds, start, picked)
+    template = _template(heard, claims)
+    entries = template[picked]
+    run = np.repeat(np.arange(len(valid)), valid.sum(axis=1))
+    for name in VALUES:
+        values = getattr(heard, name)
+        if len(values) > 1:
+            entries[name] = values[run, picked]
+    ee, en, nn = floored(heard)
+    for name, values in zip(COVARIANCES, (ee, en, nn), strict=True):
+        if len(values) > 1:
+            entries[name] = values[run, picked]
+    return Lists(start, entries), run, picked
+
+
+def reports(heard: Tracks, lists: Lists, *, max_age_s: float, at: Instants | None = None) -> Reports:
+    """The same lists as one configuration's receiver has them: when each arrives, and which it goes by when.
+
+    `at`: some of the instants.
+    """
+    at = at or instants(heard, max_age_s=max_age_s)
+    return Reports(
+        heard.units, heard.frame_unit_ix, heard.captured_s, heard.arrives_s[0], lists,
+        at.issue_s, at.newest, at.arrived, at.arrived_start,
+    )  # fmt: skip
+
+
+def _template(heard: Tracks, claims: Claims) -> Entries:
+    """(P,) all that is the same in all runs."""
+    entries = np.zeros(len(heard.frame_ix), dtype=ENTRY)
+    for name in VALUES:
+        if len(values := getattr(heard, name)) == 1:
+            entries[name] = values[0]
+    for name, values in zip(COVARIANCES, floored(heard), strict=True):
+        if len(values) == 1:
+            entries[name] = values[0]
+    entries["existence"], entries["class_probability"] = claims.existence, claims.class_probability
+    entries["track_id"] = claims.track_id
+    entries["captured_s"], entries["unit_ix"] = heard.row_captured_s, heard.row_unit_ix
+    return entries
+
+
+@nb.njit(cache=True, nogil=True)
+def _pick(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, picked: Int) -> None:
+    n = 0
+    for s in range(valid.shape[0]):
+        start[s, 0] = n
+        for f in range(len(bounds) - 1):
+            first = n
+            for k in range(bounds[f], bounds[f + 1]):
+                p = order[k]
+                if not valid[s, p]:
+                    continue
+                at = n  # insertion by the number drawn
+                while at > first and drawn[s, picked[at - 1]] > drawn[s, p]:
+                    picked[at] = picked[at - 1]
+                    at -= 1
+                picked[at] = p
+                n += 1
+            start[s, f + 1] = n

@@ -1,0 +1,21 @@
+"""What tells whether a recording is still the one that was replayed."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from copem_replay.io.containers.rosbag2_metadata import files_of
+from copem_replay.io.log import open_file
+
+
+def sha256_of(path: Path) -> str:
+    """Of a file; of a folder of rosbag2, of its files one after the other, as `cat` has them.
+
+    Raises RecordingError: it cannot be read, or the folder is none of rosbag2.
+    """
+    digest = hashlib.sha256()
+    for place in files_of(path) if path.is_dir() else [path]:
+        with open_file(place) as file:
+            hashlib.file_digest(file, lambda: digest)  # type: ignore[arg-type]  # it has `readinto`
+    return digest.hexdigest()

@@ -1,0 +1,124 @@
+"""`metadata.yaml` of a rosbag2 folder: which files it has, and what keeps them from being read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
+
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.text import counted
+from copem_replay.core.yaml import NotYamlError, composed
+from copem_replay.io.containers.unsupported import CONVERT, unpacking
+
+METADATA = "metadata.yaml"
+_INFORMATION = "rosbag2_bagfile_information"
+_LONGEST_BYTES = 1 << 19
+"""A longer description is none (chosen: three hundred topics and a thousand files take half of it)."""
+
+_DEEPEST = 100  # brackets within brackets (chosen: rosbag2 writes none)
+_BRACKET = re.compile(rb"[\[\]{}]")
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The MCAP files of a folder in the order it names them: all are there. Raises RecordingError."""
+    place = folder / METADATA
+    information = _information(folder)
+    storage = _text(information, "storage_identifier")
+    names = _names(information)
+    if not names:
+        raise RecordingError(f"{place}: names no file (`relative_file_paths`)")
+    if storage == "sqlite3" or any(name.endswith(".db3") for name in names):
+        raise RecordingError(f"{folder}: its files are of SQLite (.db3), which is not read; {CONVERT}")
+    if _text(information, "compression_mode").lower() == "message":
+        raise RecordingError(f"{folder}: its messages are compressed one by one, which is not read; {CONVERT}")
+    return [_file(folder, name) for name in names]
+
+
+def unnamed_in(folder: Path, named: Sequence[Path]) -> Iterator[str]:
+    """Say that there are more MCAP files in a folder than it names."""
+    known = {path.name for path in named}
+    others = sorted(path.name for path in folder.glob("*.mcap") if path.name not in known)
+    if others:
+        more = " …" if len(others) > 1 else ""
+        yield f"{counted(len(others), 'file')} that {METADATA} does not name not read: {others[0]}{more}"
+
+
+def _information(folder: Path) -> Node:
+    place = folder / METADATA
+    try:
+        with place.open("rb") as file:
+            content = file.read(_LONGEST_BYTES + 1)
+    except FileNotFoundError:
+        how = "; name its files as logs of their own, or let `ros2 bag reindex` write it: then they are one"
+        inside = how if any(folder.glob("*.mcap")) else ""
+        raise RecordingError(f"{folder}: expected a recording, found a folder without {METADATA}{inside}") from None
+    except OSError as error:
+        raise RecordingError(f"{place}: cannot be opened: {error.strerror}") from None
+    if len(content) > _LONGEST_BYTES:
+        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found more than 512 KiB")
+    if _depth(content) > _DEEPEST:
+        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found brackets nested too deeply")
+    try:
+        root = composed(content.decode())
+    except UnicodeDecodeError:
+        raise RecordingError(f"{place}: expected YAML, found text that is not UTF-8") from None
+    except NotYamlError as error:
+        raise RecordingError(f"{place}: not YAML: line {error.line}: {error.why}") from None
+    information = _inner(root, _INFORMATION)
+    if not isinstance(information, MappingNode):
+        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found no `{_INFORMATION}`")
+    return information
+
+
+def _depth(content: bytes) -> int:
+    """How many brackets are open at most: what the YAML library reads takes time with the square of them."""
+    deepest = depth = 0
+    for found in _BRACKET.finditer(content):
+        depth += 1 if found[0] in b"[{" else -1
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _names(information: Node) -> list[str]:
+    """Each file once: `relative_file_paths`, and those that only `files` has."""
+    listed = _inner(information, "relative_file_paths")
+    names = [item.value for item in _items(listed) if isinstance(item, ScalarNode)]
+    names += [_text(item, "path") for item in _items(_inner(information, "files"))]
+    return list(dict.fromkeys(name for name in names if name))
+
+
+def _file(folder: Path, name: str) -> Path:
+    path = folder / name
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\0" in name:
+        raise RecordingError(f"{folder / METADATA}: expected files of the folder, found {name!r}")
+    how = unpacking(path)
+    try:
+        if how is not None and path.with_suffix("").is_file():  # it was unpacked; what describes it stays as it is
+            return path.with_suffix("")
+        there = path.exists()
+    except OSError:  # a name that no file can have
+        there = False
+    if not there:
+        raise RecordingError(f"{path}: no such file, but {METADATA} names it")
+    if how is not None:
+        raise RecordingError(f"{path}: {how}")
+    return path
+
+
+def _inner(node: Node | None, name: str) -> Node | None:
+    """What a key of a mapping holds; aliases are not followed through, so that nothing can grow."""
+    if not isinstance(node, MappingNode):
+        return None
+    return next((v for k, v in node.value if isinstance(k, ScalarNode) and k.value == name), None)
+
+
+def _items(node: Node | None) -> list[Node]:
+    return list(node.value) if isinstance(node, SequenceNode) else []
+
+
+def _text(node: Node | None, name: str) -> str:
+    inner = _inner(node, name)
+    return str(inner.value) if isinstance(inner, ScalarNode) else ""

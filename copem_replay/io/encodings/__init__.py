@@ -1,0 +1,1 @@
+"""Messages of any schema, taken apart into columns: CDR, protobuf, JSON."""

@@ -1,0 +1,320 @@
+"""Reading a recording: the world as the log has it.
+
+Selects the truth by the names of schemas, decodes it, and says what it skipped, derived or corrected.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.text import counted, printable
+from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
+from copem_replay.io import log as container
+from copem_replay.io.ground_truth import assemble
+from copem_replay.io.log import Channel, Log
+from copem_replay.io.schemas import osi_ground_truth as osi
+from copem_replay.io.schemas.decoded import Columns
+from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
+
+if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
+    from copem_replay.experiment.schema import EgoTopic
+    from copem_replay.io.recorded_osi import RecordedLists
+    from copem_replay.io.schemas.object_lists import Fields
+    from copem_replay.io.world_frame import Surroundings
+
+_SHOWN = 12  # ids or topics named in an error (chosen)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log as it was read.
+
+    `truth` has the one unit TRUTH, one run, and arrives as it is captured. `host_id` is the host vehicle as
+    the log names it, whether or not there is such an object; `scene.ego_ix` is −1 where there is none.
+    """
+
+    scene: Scene
+    truth: Tracks
+    path: Path
+    topic: str
+    notes: tuple[str, ...]  # a line per kind of thing derived, corrected, skipped or ignored
+    host_id: str | None
+    damage: str | None = None  # what is wrong with the file and how far it could be read; among the notes, too
+    lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
+    around: Surroundings | None = None  # frames of reference, where lists other than OSI's are read
+    encoding: str = "protobuf"  # of the messages of the truth
+    world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
+    window: Window | None = None  # of log time, that was read; None: all
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
+
+
+def read(
+    path: Path | str,
+    *,
+    name: str,
+    ego: str | EgoTopic | None = None,
+    topic: str | None = None,
+    fields: Fields | None = None,
+    beside: Collection[str] = (),
+    window_s: WindowSeconds = None,
+) -> Recording:
+    """Read the truth of the recording at `path`, as the log called `name`.
+
+    `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
+    odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
+    have what, None where that is known. `beside`: topics that somebody else reads.
+    `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
+    on the topic of the truth was logged; None: from the beginning, to the end.
+    Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
+    or several; EmptyWindowError.
+    """
+    log = container.open_log(Path(path))
+    return read_log(log, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
+def read_log(
+    log: Log,
+    *,
+    name: str,
+    ego: str | EgoTopic | None = None,
+    topic: str | None = None,
+    fields: Fields | None = None,
+    beside: Collection[str] = (),
+    window_s: WindowSeconds = None,
+) -> Recording:
+    """Do the same with a log that was opened before."""
+    asked = None if isinstance(ego, str) else ego
+    topic, ignored = choose_topic(log, topic, beside, fields, asked)
+    try:
+        log = cut_out(log, topic, window_s)
+        columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
+    except container.BrokenIndexError as error:
+        log = cut_out(log.from_start(error), topic, window_s)
+        columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
+    scene, truth, found = assemble(columns, name)
+    notes = [*columns.notes, *found]
+    if scene is None or truth is None:
+        messages = counted(sum(c.messages for c in log.channels if c.topic == topic), "message")
+        inside = "the window" if log.window is not None else messages
+        damage = _damage(log, topic, None)
+        why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
+        raise RecordingError(f"{log.path}: {topic}: no usable object in {inside}{why}")
+    host, said = _host(columns.hosts)
+    ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
+    damage = _damage(log, topic, scene.end_s)
+    cut = window_notes(window_s)
+    notes = [*([damage] if damage else []), *cut, *log.notes, *ignored, *notes, *said, *more]
+    sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
+    scene = replace(scene, ego_ix=ego_ix, ego_sized=sized)
+    said_all = tuple(printable(note) for note in notes)
+    encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
+    return Recording(
+        scene, truth, log.path, topic, said_all, host, damage,
+        around=around, encoding=encoding, world=world, window=log.window,
+        lane_boundaries=columns.lane_boundaries,
+    )  # fmt: skip
+
+
+def is_truth(channel: Channel) -> bool:
+    """Whether the channel holds the truth in a format of this version."""
+    return channel.schema in osi.TRUTH_SCHEMAS and channel.encoding == "protobuf"
+
+
+def truth_topics(log: Log) -> dict[str, str]:
+    """Topics with at least one message of the truth, and their schema: OSI's, else other lists of objects with ids."""
+    osis = {c.topic: c.schema for c in log.channels if is_truth(c) and c.messages}
+    ours = {c.topic for c in log.channels if c.topic.startswith("copem/")}
+    if osis or not foreign(log):
+        return osis
+    from copem_replay.io.schemas.registry import names_objects
+    from copem_replay.io.world_frame import known_lists
+
+    others = {c.topic: c.schema for c in known_lists(log) if names_objects(c)}
+    return {t: schema for t, schema in others.items() if t not in ours} or others
+
+
+def foreign(log: Log) -> list[Channel]:
+    """Channels with messages that are not OSI's."""
+    return [c for c in log.channels if c.messages and not c.schema.startswith("osi3.")]
+
+
+def choose_topic(
+    log: Log,
+    topic: str | None = None,
+    beside: Collection[str] = (),
+    fields: Fields | None = None,
+    asked: EgoTopic | None = None,
+) -> tuple[str, list[str]]:
+    """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
+    if not any(c.messages for c in log.channels):
+        raise RecordingError(f"{log.path}: holds no message ({_listed(log.channels) or 'and no channel'})")
+    topics = truth_topics(log)
+    if topic is not None and foreign(log):
+        from copem_replay.io.world_frame import known_lists
+
+        topics |= {c.topic: c.schema for c in known_lists(log) if c.topic == topic}
+    if fields is not None:
+        topics = {c.topic: c.schema for c in log.channels if c.messages}
+        if topic not in topics:
+            raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; messages are on {_named(topics)}")
+        return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
+    if not topics:
+        raise RecordingError(
+            f"{log.path}: no list of true objects; it holds {_listed(log.channels)}; "
+            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
+        )
+    if topic is not None and topic not in topics:
+        raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; they are on {_named(topics)}")
+    chosen = topic if topic is not None else _only(topics)
+    if chosen is None:
+        raise RecordingError(
+            f"{log.path}: true objects on several topics, {_named(topics)}: "
+            "choose one with `read: {topic: …}` in the experiment"
+        )
+    poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
+    return chosen, _ignored(log, chosen, topics, beside, poses_read=poses_read)
+
+
+def _only(topics: dict[str, str]) -> str | None:
+    """Find the topic to take unasked: the only one, or the only GroundTruth beside SensorViews."""
+    truths = [t for t, schema in topics.items() if schema == osi.GROUND_TRUTH]
+    candidates = truths or list(topics)
+    return candidates[0] if len(candidates) == 1 else None
+
+
+def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[str], *, poses_read: bool) -> list[str]:
+    """Say what is not read."""
+    notes = [f"topic {t} ({schema}) not read: {chosen} taken" for t, schema in topics.items() if t != chosen]
+    skipped = Counter[str]()
+    poses: set[int] = set()
+    if poses_read and (others := foreign(log)):
+        from copem_replay.io.schemas.poses import is_pose
+
+        poses = {c.number for c in others if is_pose(c)}
+    for channel in log.channels:
+        there = channel.messages and channel.number not in poses
+        of_topic = is_truth(channel) or channel.schema == topics.get(
+            channel.topic
+        )  # else another kind of message on it
+        if there and not (channel.topic in topics and of_topic) and channel.topic not in beside:
+            skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
+    return notes + [f"{counted(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
+
+
+def _columns(
+    log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, *, seek_ego: bool
+) -> tuple[Columns, Surroundings | None, str]:
+    """All that is on a topic, in the world, and the ego; the world's name. Raises RecordingError, BrokenIndexError."""
+    channels = [c for c in log.channels if c.topic == topic and c.messages]
+    if fields is None and any(not is_truth(c) for c in channels):  # channels of one topic may be of several schemas
+        from copem_replay.io.schemas.registry import is_list, names_objects
+
+        channels = [c for c in channels if is_truth(c) or is_list(c)]
+        channels.sort(key=lambda c: not names_objects(c))
+    if not channels:
+        raise RecordingError(f"{log.path}: {topic}: no message can be read{f' ({log.damage})' if log.damage else ''}")
+    if fields is None and any(is_truth(c) for c in channels):
+        columns = _decode(log, topic)
+        if asked is None:
+            return columns, None, ""
+        from copem_replay.io.world_frame import surroundings, with_ego
+
+        around = surroundings(log, asked, seek_ego=False)
+        return _with_notes(with_ego(columns, around), around), around, ""
+    from copem_replay.io.schemas.registry import names_objects
+    from copem_replay.io.world_frame import in_world, lists_of, surroundings, with_ego
+
+    around = surroundings(log, asked, seek_ego=seek_ego)
+    mine = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
+    found = lists_of(log, mine, fields)
+    if (fields is None and not names_objects(mine[0])) or (fields is not None and fields.id is None):
+        raise RecordingError(
+            f"{log.path}: {topic}: its objects have no ids; lists of a unit they can be, not the truth"
+        )
+    world = around.world_of(found)
+    found = in_world(found, around, f"{log.path}: {topic}")
+    return _with_notes(with_ego(found.columns, around), around), around, world
+
+
+def _with_notes(columns: Columns, around: Surroundings) -> Columns:
+    return replace(columns, notes=(*columns.notes, *around.notes))
+
+
+def _decode(log: Log, topic: str) -> Columns:
+    """All messages of the truth on a topic. Raises BrokenIndexError."""
+    schema_of = {c.number: c.schema for c in log.channels if c.topic == topic and is_truth(c)}
+    decoder = osi.Decoder()
+    for number, log_time_ns, payload in log.payloads(frozenset(schema_of)):
+        decoder.add(payload, schema=schema_of[number], log_time_ns=log_time_ns)
+    return decoder.columns()
+
+
+def _damage(log: Log, topic: str, end_s: float | None) -> str | None:
+    """Say what is wrong with the file, and how far it could be read."""
+    if log.damage is None:
+        return None
+    if log.complete:
+        return f"damaged: {log.damage}"
+    if log.window is not None:
+        return f"damaged: what is lost may be of the window ({log.damage})"
+    channels = [c for c in log.channels if c.topic == topic]
+    number = sum(c.messages for c in channels)
+    expected = sum(c.expected for c in channels if c.expected is not None)
+    of = f" of {expected}" if expected else ""
+    after = "damaged" if end_s is None or log.went_on else f"damaged after {end_s:.3f} s"
+    return f"{after}: {number}{of} messages read ({log.damage})"
+
+
+def _host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Find the host vehicle's id, None where no message says one, and notes."""
+    if not hosts:
+        return None, []
+    said = Counter(hosts).most_common()  # of equally frequent ones the first
+    if len(said) == 1:
+        return said[0][0], []
+    ids = ", ".join(f"{ident} in {counted(number, 'message')}" for ident, number in said[:_SHOWN])
+    return said[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
+
+
+def _ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[int, list[str]]:
+    """Index of the ego vehicle, −1 without one, and notes. Raises RecordingError: no such moving object."""
+    wanted = host if ego is None else ego
+    index = -1 if wanted is None else scene.object_number.get(wanted, -1)
+    if index >= 0 and scene.moving[index]:
+        return index, []
+    if ego is not None:
+        raise RecordingError(f"{path}: ego: no moving object {ego!r}; there are {moving_ids(scene)}")
+    if host is not None:
+        return -1, [f"the host vehicle {host} is not among the moving objects: no ego vehicle"]
+    return -1, []
+
+
+def moving_ids(scene: Scene, shown: int = _SHOWN) -> str:
+    """`3 (car), 7 (pedestrian), … (12 in all)`: moving objects, vehicles first, then by appearance."""
+    movers = np.flatnonzero(scene.moving)
+    names = [(scene.object_ids[k], CLASSES[scene.object_class[k]]) for k in movers]
+    names.sort(key=lambda n: n[1] in ("pedestrian", "bicycle", "animal", "other"))
+    text = ", ".join(f"{ident} ({what})" for ident, what in names[:shown])
+    return f"{text}, … ({len(names)} in all)" if len(names) > shown else text or "none"
+
+
+def _named(topics: dict[str, str]) -> str:
+    return ", ".join(f"{topic} ({schema})" for topic, schema in topics.items())
+
+
+def _listed(channels: Sequence[Channel]) -> str:
+    """Schemas and topics of a file, for an error."""
+    names = [
+        f"{c.schema or 'no schema'}{'' if c.encoding == 'protobuf' else f' ({c.encoding})'} on {c.topic}"
+        for c in channels
+    ]
+    more = f", … ({counted(len(names), 'topic')} in all)" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

@@ -1,0 +1,1 @@
+"""A replay as MCAP: the recording untouched, and what each configuration lists."""

@@ -1,0 +1,83 @@
+"""foxglove.SceneUpdate: a fused list as boxes for Foxglove and Lichtblick.
+
+Every message deletes all that was on its topic and draws the list anew, so playback shows the right boxes after a seek
+and nothing piles up (entities replace by id and live until deleted).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from copem_replay.core.colours import Rgb
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import CLASSES, Scene
+
+SCHEMA = "foxglove.SceneUpdate"
+FRAME_ID = "global"
+"""Name of the world frame in the OSI converters of these viewers."""
+ALPHA = 0.5
+"""How opaque boxes are (chosen: what is inside stays visible)."""
+
+
+def message_class() -> Any:
+    """The SceneUpdate class, imported when first needed."""
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    return SceneUpdate
+
+
+class SceneWriter:
+    """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
+
+    def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb, frame_id: str = FRAME_ID) -> None:
+        fused = belief.fused
+        self._listed = belief.listed
+        # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
+        names = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
+        kinds = belief.class_of(scene).tolist()
+        made = {
+            key: _prototype(key[0], metadata(*key, configuration), colour, frame_id)
+            for key in dict.fromkeys(zip(names, kinds, strict=True))
+        }
+        self._prototype = [made[key] for key in zip(names, kinds, strict=True)]
+        half = fused.yaw_rad[0] / 2
+        columns = [getattr(fused, n)[0] for n in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")]
+        self._values = list(zip(*(c.tolist() for c in (*columns, np.sin(half), np.cos(half))), strict=True))
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        """List number `frame` as it became available at `available_ns` of the log's clock."""
+        from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+
+        update = message_class()()
+        deletion = update.deletions.add()
+        deletion.type = SceneEntityDeletion.ALL
+        deletion.timestamp.FromNanoseconds(available_ns)
+        for row in self._listed(frame):
+            entity = update.entities.add()
+            entity.CopyFrom(self._prototype[row])
+            entity.timestamp.CopyFrom(deletion.timestamp)
+            cube = entity.cubes[0]
+            at, turn, size = cube.pose.position, cube.pose.orientation, cube.size
+            at.x, at.y, at.z, size.x, size.y, size.z, turn.z, turn.w = self._values[row]
+        encoded: bytes = update.SerializeToString(deterministic=True)
+        return encoded
+
+
+def metadata(name: str, class_ix: int, configuration: str) -> dict[str, str]:
+    """What a click on a box tells."""
+    return {"configuration": configuration, "class": CLASSES[class_ix], "object": name}
+
+
+def _prototype(name: str, said: dict[str, str], colour: Rgb, frame_id: str) -> Any:
+    """A box with all that its object and its configuration say."""
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+
+    entity = SceneEntity(frame_id=frame_id, id=name)
+    for key, text in said.items():
+        entity.metadata.add(key=key, value=text)
+    color = entity.cubes.add().color
+    color.r, color.g, color.b = (c / 255 for c in colour)
+    color.a = ALPHA
+    return entity

@@ -1,0 +1,167 @@
+"""MCAP out: the input's channels with their messages untouched, and what each configuration believed.
+
+For each configuration three channels: `copem/<configuration>/objects` (what was believed), `…/scene` (the same as
+boxes) and `…/detail` (JSON: what the objects cannot carry), in messages of the input's family (`io/write/message_family.py`), one per
+fused list, log_time = publish_time = the instant it was available. The same input gives the same bytes; the file
+appears under its name when it is complete, or not at all.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from mcap.records import Message
+from mcap.writer import Writer
+
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.files import atomic_file
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import SAME_INSTANT_NS, Scene, Tracks
+from copem_replay.io.window import Window
+from copem_replay.io.write import detail_json as detail
+from copem_replay.io.write.message_family import OSI_CHANNEL, Family, ListWriter, Osi, osi_version, topics_of
+from copem_replay.io.write.pass_through import Catalogue
+from copem_replay.io.write.source import Source, source_of
+
+OSI_RECORD = "net.asam.osi.trace"
+"""The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
+RUN_RECORD = "org.copem_replay.pipeline.run"
+"""Our own record: what made the file."""
+ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
+"""rosbag2's own record, and what in it counts the messages: no longer true of a copy with more of them."""
+
+
+def write_mcap(
+    path: Path,
+    source: Path,
+    scene: Scene,
+    beliefs: Iterable[Mapping[str, Belief]],
+    table: pd.DataFrame,
+    manifest: Mapping[str, str],
+    family: Family | None = None,
+    window: Window | None = None,
+) -> list[str]:
+    """`source` with the fused lists of one run added, `beliefs` by configuration, stretch by stretch: values (1, P).
+
+    `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
+    `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
+    `window`: of `source` that was read, None: all.
+
+    Returns what has to be said of what could not be copied, or was replaced.
+
+    Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
+    """
+    original = source_of(source, window)
+    family = family or Osi()
+    rest = iter(beliefs)
+    first = next(rest)  # it tells the configurations and the units
+    colours = configuration_colours(first)
+    units = dict.fromkeys(unit for belief in first.values() for unit in belief.heard.units)
+    numbers = {unit: k + 1 for k, unit in enumerate(units)}
+    with atomic_mcap(path, profile=original.profile) as writer:
+        catalogue = Catalogue(writer)
+        ours = {topic for name in first for topic in topics_of(name)}
+        messages = original.messages(original.register(catalogue, without=ours))
+        opened = family.open(catalogue, scene, numbers)
+
+        def lists_of(stretch: Mapping[str, Belief]) -> list[Iterator[Message]]:
+            return [
+                _lists(
+                    scene,
+                    belief.fused,
+                    opened.channels(
+                        name, belief, _events(belief.fused, table[table["configuration"] == name]), colours[name]
+                    ),
+                )
+                for name, belief in stretch.items()
+            ]
+
+        begun = lists_of(first)  # registers the channels
+        del first
+        added = chain.from_iterable(
+            _in_order(streams) for streams in chain([begun], (lists_of(stretch) for stretch in rest))
+        )
+        units_record = {f"unit.{number}": unit for unit, number in numbers.items()}
+        for name, record in _kept(original).items():
+            if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
+                writer.add_metadata(name, record)
+        writer.add_metadata(RUN_RECORD, dict(sorted({**manifest, **units_record}.items())))
+        if family.osi:
+            writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
+        for message in _in_order([messages, added]):
+            writer.add_message(
+                message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
+            )
+    replaced = sorted(ours & {channel.topic for channel in original.channels.values()})
+    notes = [f"{len(replaced)} topics of an earlier replay are replaced ({replaced[0]} …)"] if replaced else []
+    return [*([original.damage] if original.damage else []), *notes]
+
+
+def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
+    return heapq.merge(*streams, key=lambda m: m.log_time)
+
+
+def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
+    for frame, available_s in enumerate(fused.arrives_s[0].tolist()):
+        available_ns = scene.t0_ns + round(available_s * 1e9)
+        for channel, writer in writers.items():
+            yield Message(channel, available_ns, writer.message(frame, available_ns), available_ns, 0)
+
+
+def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]:
+    """What was detected with each list: detections by the index of the list that was then available."""
+    events: dict[int, list[detail.Event]] = {}
+    issue_s, tolerance_s = fused.arrives_s[0], 2e-9 * SAME_INSTANT_NS
+    if not len(issue_s):
+        return events
+    # The others are of other stretches.
+    here = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
+    for row in table[table["detected"] & here].to_dict("records"):
+        frame = int(np.abs(issue_s - row["detection_s"]).argmin())
+        event = {"object": row["object_id"], "first_unit": row["first_unit"]}
+        for name in ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m"):
+            event[name] = None if row[name] != row[name] else float(row[name])
+        events.setdefault(frame, []).append(event)
+    return events
+
+
+def _kept(original: Source) -> dict[str, dict[str, str]]:
+    """The input's metadata records, without what its new messages belie."""
+    records = dict(original.metadata)
+    rosbag = records.pop(ROSBAG_RECORD, {})
+    rest = {key: value for key, value in rosbag.items() if key != ROSBAG_COUNTS}
+    return records | ({ROSBAG_RECORD: rest} if rest else {})
+
+
+def _osi_record(original: Source, osi_version: str, protobuf: str) -> dict[str, str]:
+    """The input's record, its ranges of versions widened to ours; a new one where it had none."""
+    record = dict(original.metadata.get(OSI_RECORD, {}))
+    for what, ours in (("osi", osi_version), ("protobuf", protobuf)):
+        key = f"{OSI_CHANNEL}{what}_version"
+        seen = [ours, *(c.metadata[key] for c in original.channels.values() if key in c.metadata)]
+        for end, pick in (("min", min), ("max", max)):
+            name = f"{end}_{what}_version"
+            record[name] = pick([*seen, *([record[name]] if record.get(name) else [])], key=_release)
+    record["version"] = record.get("version") or osi_version
+    return dict(sorted(record.items()))
+
+
+def _release(text: str) -> tuple[int, ...]:
+    return tuple(int(part) if part.isdigit() else 0 for part in text.split("."))
+
+
+@contextmanager
+def atomic_mcap(path: Path, *, profile: str) -> Iterator[Writer]:
+    """A writer whose file gets its name when it is complete; whatever goes wrong before leaves nothing behind."""
+    with atomic_file(path) as scratch, scratch.open("wb") as file:
+        writer = Writer(file, enable_data_crcs=True)
+        writer.start(profile=profile, library="copem_replay")
+        yield writer
+        writer.finish()  # type: ignore[no-untyped-call]

@@ -1,0 +1,189 @@
+"""In what messages a replay is written: those of the family its recording is of.
+
+`Osi`: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON; for all recordings but those of ROS 2. `Ros2`: CDR
+only, for a file of the profile `ros2` holds nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, Protocol
+
+from copem_replay.core.colours import Rgb
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import Scene
+from copem_replay.io.recording import Recording
+from copem_replay.io.write import (
+    autoware_objects as detected_objects,
+)
+from copem_replay.io.write import (
+    cdr_writer as cdr_write,
+)
+from copem_replay.io.write import (
+    detail_json as detail,
+)
+from copem_replay.io.write import (
+    foxglove_scene as foxglove,
+)
+from copem_replay.io.write import (
+    foxglove_scene_ros2 as foxglove_ros2,
+)
+from copem_replay.io.write import (
+    osi_sensor_data as sensor_data,
+)
+from copem_replay.io.write.pass_through import Catalogue
+from copem_replay.io.write.ros2_definitions import STRING, definition
+
+OSI_CHANNEL = "net.asam.osi.trace.channel."
+_NAMELESS = "map"  # chosen: what the world is called where nobody says it, as REP 105 has it
+
+_FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"
+QOS = (
+    f"- history: 1\n  depth: 10\n  reliability: 1\n  durability: 2\n  deadline:{_FOREVER}\n  lifespan:{_FOREVER}\n"
+    f"  liveliness: 1\n  liveliness_lease_duration:{_FOREVER}\n  avoid_ros_namespace_conventions: false"
+)
+"""`offered_qos_profiles` as rosbag2 writes them: keep last 10, reliable, volatile; no deadline."""
+
+
+class ListWriter(Protocol):
+    """Turns the fused lists of one configuration into messages of one channel."""
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        """List number `frame` as it became available at `available_ns` of the log's clock."""
+
+
+class Opened(Protocol):
+    """A family whose schemas are in the file that is being written."""
+
+    def channels(
+        self, name: str, belief: Belief, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+    ) -> dict[int, ListWriter]:
+        """The channels of a configuration: `objects`, `scene`, `detail`, in this order."""
+
+
+class Family(Protocol):
+    """A family, chosen."""
+
+    osi: bool
+    """Whether osi3 messages are written."""
+
+    def open(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int]) -> Opened:
+        """The schemas put into a file; `units`: the numbers by which units go."""
+
+
+def family_of(recording: Recording) -> Family:
+    """The family a recording is of, by how the truth is encoded."""
+    if recording.encoding == "cdr":
+        return Ros2(recording.world or _NAMELESS)
+    return Osi(recording.world or foxglove.FRAME_ID)
+
+
+def topics_of(configuration: str) -> list[str]:
+    """The topics of a configuration, whatever the family."""
+    return [f"copem/{configuration}/{kind}" for kind in ("objects", "scene", "detail")]
+
+
+def osi_version() -> str:
+    """Of OSI, what is written."""
+    return ".".join(map(str, sensor_data.OSI_VERSION))
+
+
+class Osi:
+    """osi3.SensorData; foxglove.SceneUpdate in the frame of reference `frame_id`; details as JSON."""
+
+    osi = True
+
+    def __init__(self, frame_id: str = foxglove.FRAME_ID) -> None:
+        self._frame_id = frame_id
+
+    def open(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int]) -> Opened:
+        """Put the schemas into a file."""
+        return _OpenedOsi(catalogue, scene, units, self._frame_id)
+
+
+class _OpenedOsi:
+    def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str) -> None:
+        self._catalogue, self._scene, self._units, self._frame_id = catalogue, scene, units, frame_id
+        self._objects = _protobuf(catalogue, sensor_data.message_class(), sensor_data.SCHEMA)
+        self._scenes = _protobuf(catalogue, foxglove.message_class(), foxglove.SCHEMA)
+        self._details = catalogue.schema(detail.SCHEMA, "jsonschema", json.dumps(detail.JSON_SCHEMA).encode())
+
+    def channels(
+        self, name: str, belief: Belief, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+    ) -> dict[int, ListWriter]:
+        description = {
+            f"{OSI_CHANNEL}description": f"fused object list of configuration {name}",
+            f"{OSI_CHANNEL}osi_version": osi_version(),
+            f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
+        }
+        objects, scenes, details = topics_of(name)
+        channel, scene = self._catalogue.channel, self._scene
+        return {
+            channel(objects, "protobuf", self._objects, description): sensor_data.SensorDataWriter(
+                scene, belief, self._units
+            ),
+            channel(scenes, "protobuf", self._scenes, {}): foxglove.SceneWriter(
+                scene, belief, name, colour, self._frame_id
+            ),
+            channel(details, "json", self._details, {}): detail.DetailWriter(scene, belief, events),
+        }
+
+
+class Ros2:
+    """autoware_perception_msgs/DetectedObjects and foxglove_msgs/SceneUpdate in the frame of reference `frame_id`; the
+    JSON of the details as std_msgs/String.
+    """
+
+    osi = False
+
+    def __init__(self, frame_id: str) -> None:
+        self._frame_id = frame_id
+
+    def open(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int]) -> Opened:
+        """Put the schemas into a file; `units` go by their names."""
+        return _OpenedRos2(catalogue, scene, self._frame_id)
+
+
+class _OpenedRos2:
+    def __init__(self, catalogue: Catalogue, scene: Scene, frame_id: str) -> None:
+        self._catalogue, self._scene, self._frame_id = catalogue, scene, frame_id
+        self._schemas = [
+            catalogue.schema(name, "ros2msg", definition(name))
+            for name in (detected_objects.SCHEMA, foxglove_ros2.SCHEMA, STRING)
+        ]
+
+    def channels(
+        self, name: str, belief: Belief, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+    ) -> dict[int, ListWriter]:
+        scene, frame_id = self._scene, self._frame_id
+        objects = detected_objects.DetectedObjectsWriter(scene, belief, frame_id)
+        details = detail.DetailWriter(scene, belief, events, sizes_of=objects.round)
+        writers: list[ListWriter] = [
+            objects,
+            foxglove_ros2.SceneWriter(scene, belief, name, colour, frame_id),
+            _AsString(details),
+        ]
+        numbers = [
+            self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
+            for topic, schema in zip(topics_of(name), self._schemas, strict=True)
+        ]
+        return dict(zip(numbers, writers, strict=True))
+
+
+class _AsString:
+    """A writer of JSON whose messages go as std_msgs/String."""
+
+    def __init__(self, writer: ListWriter) -> None:
+        self._writer = writer
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        return cdr_write.string_message(self._writer.message(frame, available_ns).decode())
+
+
+def _protobuf(catalogue: Catalogue, message_class: Any, name: str) -> int:
+    from mcap_protobuf.schema import build_file_descriptor_set
+
+    data = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)
+    return catalogue.schema(name, "protobuf", data)

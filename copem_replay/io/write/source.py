@@ -1,0 +1,105 @@
+"""A recording on its way into the output, whatever its container: an MCAP file, a folder of them, an OSI trace.
+
+The files of a folder are merged: what several of them have alike (schemas, channels, records, attachments) is kept
+once. A trace becomes a channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Protocol
+
+from mcap.records import Channel, Message
+
+from copem_replay.io.containers.mcap_indexed import renumbered
+from copem_replay.io.containers.osi_trace import Trace, message_class
+from copem_replay.io.containers.rosbag2 import Bag, merged
+from copem_replay.io.log import open_log
+from copem_replay.io.window import Window
+from copem_replay.io.write.message_family import OSI_CHANNEL, osi_version
+from copem_replay.io.write.pass_through import Catalogue, Original
+
+
+class Source(Protocol):
+    """What is in a recording besides its messages, and its messages on demand: see `Original`."""
+
+    profile: str
+    metadata: dict[str, dict[str, str]]
+    channels: dict[int, Channel]
+    damage: str | None
+
+    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
+        """Put schemas, channels and attachments into the output, but for some topics."""
+
+    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
+        """The messages in order of log time, with the channel numbers of the output."""
+
+
+def source_of(path: Path, window: Window | None = None) -> Source:
+    """What can be copied of a recording, or of a window of it. Raises RecordingError where nothing can be read."""
+    log = open_log(path).within(window)
+    if isinstance(log, Bag):
+        return _OfBag(log)
+    return _OfTrace(log) if isinstance(log, Trace) else Original(log)
+
+
+class _OfBag:
+    def __init__(self, bag: Bag) -> None:
+        self._files = [Original(part.log) for part in bag.parts]
+        self.profile = self._files[0].profile
+        self.metadata: dict[str, dict[str, str]] = {}
+        for file in self._files:
+            for name, record in file.metadata.items():
+                self.metadata.setdefault(name, {}).update(record)
+        every = [(k, number, c) for k, file in enumerate(self._files) for number, c in file.channels.items()]
+        self._place = {place: (k, number) for place, (k, number, _) in enumerate(every)}
+        self.channels = {place: channel for place, (_, _, channel) in enumerate(every)}
+        whole = not bag.lost and not any(file.damage for file in self._files)
+        self.damage = None if whole else "damaged: its messages are copied as far as they can be read"
+
+    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
+        numbers = [file.register(catalogue, without) for file in self._files]
+        return {place: numbers[k][n] for place, (k, n) in self._place.items() if n in numbers[k]}
+
+    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
+        of_file: list[dict[int, int]] = [{} for _ in self._files]
+        for place, number in numbers.items():
+            k, theirs = self._place[place]
+            of_file[k][theirs] = number
+        return merged(
+            [(f.start_ns, partial(f.messages, mine)) for f, mine in zip(self._files, of_file, strict=True) if mine]
+        )
+
+
+class _OfTrace:
+    profile = ""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace = trace
+        (self._channel,) = trace.channels
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.damage = None if trace.complete else "damaged: its messages are copied as far as they can be read"
+        about = {
+            f"{OSI_CHANNEL}description": f"the trace {trace.path.name}",
+            f"{OSI_CHANNEL}osi_version": trace.osi_version or osi_version(),
+            f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
+        }
+        number, topic = self._channel.number, self._channel.topic
+        self.channels = {number: Channel(number, topic, self._channel.encoding, about, number)}
+
+    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
+        from mcap_protobuf.schema import build_file_descriptor_set
+
+        of = build_file_descriptor_set(message_class(self._channel.schema)).SerializeToString(deterministic=True)
+        schema = catalogue.schema(self._channel.schema, "protobuf", of)
+        return {
+            number: catalogue.channel(channel.topic, channel.message_encoding, schema, channel.metadata)
+            for number, channel in self.channels.items()
+            if channel.topic not in without
+        }
+
+    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
+        return (renumbered(message, numbers) for message in self._trace.messages(numbers.keys()))

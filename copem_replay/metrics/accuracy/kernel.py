@@ -1,0 +1,373 @@
+"""The sums of `metrics/accuracy/statistics.py`, in one pass over lists of all runs. What they mean is said there."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
+from copem_replay.metrics.gospa import gospa_pairs
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, most_probable
+
+SMALLEST_VARIANCE_M2 = 1e-9
+"""Eigenvalues of a covariance count as at least this (the contract's)."""
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+Records = NDArray[Any]
+
+
+class World(NamedTuple):
+    """The truth list by list, in each by object: frame f is rows `start[f] : start[f + 1]`."""
+
+    captured_s: Float  # (F,) ascending
+    start: Int  # (F + 1,)
+    object_ix: Int  # (P,), as all that follow
+    x_m: Float
+    y_m: Float
+    vx_mps: Float
+    vy_mps: Float
+
+
+class Stays(NamedTuple):
+    """Which lists count for each look. All (M,) but the first."""
+
+    look_of: Int  # (N,) by object, −1: not measured
+    first_list: Int  # lists first_list … first_list + lists − 1
+    lists: Int
+    column: Int  # of the first one in the arrays list by list
+    onset_s: Float
+    ended_s: Float
+
+
+class Asked(NamedTuple):
+    """Parameters."""
+
+    cutoff_m: float
+    power: float
+    measured_class: Bool  # (C,)
+    distance_edges_m: Float
+    time_edges_s: Float
+    existence_thresholds: Float
+
+
+class Sums(NamedTuple):
+    """Where the sums go: fields and shapes are those of `Accuracy`."""
+
+    error_m: NDArray[np.float32]
+    gospa: NDArray[np.float32]
+    by_object: Records
+    by_run: Records
+    ghosts_at: Int
+    by_distance: Records
+    by_time: Records
+    by_existence: Records
+
+
+class SoFar(NamedTuple):
+    """What goes on from list to list. All (S, M)."""
+
+    last_track: Int  # as which it was matched last, −1: as none
+    unknown_since_s: Float  # NaN: known
+
+
+class _Here(NamedTuple):
+    # The objects whose stay has the list at hand, and their matches in the run at hand.
+    look: Int
+    row: Int  # of the truth
+    distance_band: Int
+    match: Int  # −1: none
+    target: Int  # its place among the targets, −1: not looked at now
+    place_of: Int  # by look: its place here, −1: not here
+
+
+class _Targets(NamedTuple):
+    # Those of them that are looked at now: the truth of GOSPA.
+    look: Int
+    x_m: Float
+    y_m: Float
+    partner: Int
+    false: Int  # believed objects without a partner that are nearest to it
+
+
+class _Believed(NamedTuple):
+    # The entries of the list at hand that GOSPA counts.
+    x_m: Float
+    y_m: Float
+    paired: Bool
+
+
+@nb.njit(cache=True, nogil=True)
+def add_up(
+    start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, world: World,
+    at_capture: World, stays: Stays, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: Asked,
+    so_far: SoFar, out: Sums,
+) -> None:  # fmt: skip
+    """Add the next K lists of S runs. Numbers of lists in `stays` count from the first of them."""
+    S, M = out.by_object.shape
+    longest = 0
+    for s in range(S):
+        for k in range(len(issue_s)):
+            longest = max(longest, start[s, k + 1] - start[s, k])
+    here = _Here(
+        np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64),
+        np.empty(M, np.int64), np.full(M, -1),
+    )  # fmt: skip
+    targets = _Targets(
+        np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64), np.empty(M, np.int64)
+    )  # fmt: skip
+    believed = _Believed(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
+    for k in range(len(issue_s)):
+        if not present[k]:
+            continue
+        from_m = (reference_x_m[k], reference_y_m[k])
+        n, looked_at = _gather(k, issue_s[k], world, stays, from_m, asked, here, targets)
+        time_band = _band(asked.time_edges_s, issue_s[k])
+        column = stays.column + (k - stays.first_list)
+        for s in range(S):
+            here.match[:n] = -1
+            count = _entries(
+                s, start[s, k], start[s, k + 1], entries, object_ix, role, stays, from_m, time_band, asked,
+                here, targets, looked_at, believed, out,
+            )  # fmt: skip
+            for h in range(n):
+                m, i = here.look[h], here.match[h]
+                if here.target[h] >= 0:
+                    _look(out.by_object[s], m, i)
+                    _look(out.by_distance[s], here.distance_band[h], i)
+                    _look(out.by_time[s], time_band, i)
+                _follow(
+                    out.by_object[s, m], m, entries, i, issue_s[k], stays, so_far.unknown_since_s[s],
+                    so_far.last_track[s],
+                )  # fmt: skip
+                if i >= 0:
+                    p = here.row[h]
+                    east_m, north_m = entries[i].x_m - world.x_m[p], entries[i].y_m - world.y_m[p]
+                    nees = _nees(entries, i, east_m, north_m)
+                    out.error_m[s, column[m]] = np.hypot(east_m, north_m)
+                    _pair(out.by_object[s], m, east_m, north_m, nees)
+                    _pair(out.by_distance[s], here.distance_band[h], east_m, north_m, nees)
+                    _pair(out.by_time[s], time_band, east_m, north_m, nees)
+                    _further(out.by_object[s, m], entries, i, issue_s[k], world, p, at_capture)
+            _gospa(out.gospa[s], column, out.by_object[s], out.by_run[s], targets, looked_at, believed, count, asked)
+        for h in range(n):
+            here.place_of[here.look[h]] = -1
+
+
+@nb.njit(cache=True, nogil=True)
+def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
+    """Add what ends with the looks, after all lists."""
+    S, M = out.by_object.shape
+    for s in range(S):
+        for m in range(M):
+            if not np.isnan(so_far.unknown_since_s[s, m]):
+                sums = out.by_object[s, m]
+                sums.mtl_s = max(sums.mtl_s, stays.ended_s[m] - so_far.unknown_since_s[s, m])
+
+
+@nb.njit(cache=True, nogil=True)
+def _gather(
+    k: int, issue_s: float, world: World, stays: Stays, from_m: tuple[float, float], asked: Asked, here: _Here,
+    targets: _Targets,
+) -> tuple[int, int]:  # fmt: skip
+    # How many objects are in their stay at list k, and how many of them are looked at.
+    n = looked_at = 0
+    for p in range(world.start[k], world.start[k + 1]):
+        m = stays.look_of[world.object_ix[p]]
+        if m < 0 or k < stays.first_list[m] or k >= stays.first_list[m] + stays.lists[m]:
+            continue
+        away_m = np.hypot(world.x_m[p] - from_m[0], world.y_m[p] - from_m[1])
+        here.look[n], here.row[n], here.place_of[m] = m, p, n
+        here.distance_band[n], here.target[n] = _band(asked.distance_edges_m, away_m), -1
+        if issue_s >= stays.onset_s[m] - _TOLERANCE_S:
+            here.target[n] = looked_at
+            targets.look[looked_at], targets.x_m[looked_at], targets.y_m[looked_at] = m, world.x_m[p], world.y_m[p]
+            looked_at += 1
+        n += 1
+    return n, looked_at
+
+
+@nb.njit(cache=True, nogil=True)
+def _entries(
+    s: int, first: int, after: int, entries: Entries, object_ix: Int, role: NDArray[np.int8], stays: Stays,
+    from_m: tuple[float, float], time_band: int, asked: Asked, here: _Here, targets: _Targets, looked_at: int,
+    believed: _Believed, out: Sums,
+) -> int:  # fmt: skip
+    # Find the matches in a list of run s, count its other entries, and say how many GOSPA counts.
+    count = 0
+    for i in range(first, after):
+        m = stays.look_of[object_ix[i]] if role[i] != GHOST else -1
+        h = here.place_of[m] if m >= 0 else -1
+        target = here.target[h] if h >= 0 else -1
+        if role[i] == MATCH and h >= 0:
+            here.match[h] = i
+        elif role[i] == DUPLICATE and m >= 0:
+            out.by_run[s].duplicates += 1
+            if target >= 0:
+                out.by_object[s, m].duplicates += 1
+        measured = asked.measured_class[most_probable(entries, i)]
+        if target >= 0 or (role[i] == GHOST and measured):
+            believed.x_m[count], believed.y_m[count] = entries[i].x_m, entries[i].y_m
+            count += 1
+        if measured:
+            existence = entries[i].existence
+            bins = out.by_existence.shape[1]
+            claim = out.by_existence[s, min(max(int(existence * bins), 0), bins - 1)]
+            claim.entries += 1
+            claim.existence += existence
+            claim.with_object += role[i] != GHOST
+            if role[i] == GHOST:
+                _ghost(s, entries[i].x_m, entries[i].y_m, existence, from_m, time_band, asked, targets, looked_at, out)
+    return count
+
+
+@nb.njit(cache=True, nogil=True)
+def _ghost(
+    s: int, x_m: float, y_m: float, existence: float, from_m: tuple[float, float], time_band: int, asked: Asked,
+    targets: _Targets, looked_at: int, out: Sums,
+) -> None:  # fmt: skip
+    out.by_run[s].ghosts += 1
+    for q in range(len(asked.existence_thresholds)):
+        out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
+    distance_band = _band(asked.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
+    if distance_band >= 0:
+        out.by_distance[s, distance_band].ghosts += 1
+    if time_band >= 0:
+        out.by_time[s, time_band].ghosts += 1
+    nearest = _nearest(x_m, y_m, targets, looked_at)
+    if nearest >= 0:
+        out.by_object[s, targets.look[nearest]].ghosts += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def _look(records: Records, at: int, match: int) -> None:
+    if at >= 0:
+        records[at].looked += 1
+        if match < 0:
+            records[at].missed += 1
+
+
+@nb.njit(cache=True, nogil=True)
+def _pair(records: Records, at: int, east_m: float, north_m: float, nees: float) -> None:
+    if at >= 0:
+        sums = records[at]
+        sums.pairs += 1
+        sums.square_m2 += east_m**2 + north_m**2
+        sums.east_m += east_m
+        sums.north_m += north_m
+        sums.nees += nees
+
+
+@nb.njit(cache=True, nogil=True)
+def _follow(
+    sums: Any, m: int, entries: Entries, i: int, issue_s: float, stays: Stays, unknown_since_s: Float, last_track: Int
+) -> None:
+    # What goes on from list to list: how long it is unknown, and as which track it is known. −1: no match.
+    now_s = min(max(issue_s, stays.onset_s[m]), stays.ended_s[m])
+    if i < 0:
+        if np.isnan(unknown_since_s[m]):
+            unknown_since_s[m] = now_s
+        return
+    if not np.isnan(unknown_since_s[m]):
+        sums.mtl_s = max(sums.mtl_s, now_s - unknown_since_s[m])
+        unknown_since_s[m] = np.nan
+    track = entries[i].track_id
+    if track >= 0:
+        sums.tracked += 1
+        sums.switches += last_track[m] >= 0 and last_track[m] != track
+        last_track[m] = track
+
+
+@nb.njit(cache=True, nogil=True)
+def _further(sums: Any, entries: Entries, i: int, issue_s: float, world: World, p: int, at_capture: World) -> None:
+    # What only objects add up: velocity, age, and the error against the truth at the capture.
+    entry = entries[i]
+    sums.velocity_square_m2ps2 += (entry.vx_mps - world.vx_mps[p]) ** 2 + (entry.vy_mps - world.vy_mps[p]) ** 2
+    sums.age_s += issue_s - entry.captured_s
+    q = _row_at(at_capture, entry.captured_s, world.object_ix[p])
+    if q >= 0:
+        sums.pairs_captured += 1
+        sums.square_captured_m2 += (entry.x_m - at_capture.x_m[q]) ** 2 + (entry.y_m - at_capture.y_m[q]) ** 2
+
+
+@nb.njit(cache=True, nogil=True)
+def _gospa(
+    gospa: NDArray[np.float32], column: Int, by_object: Records, sums: Any, targets: _Targets, looked_at: int,
+    believed: _Believed, count: int, asked: Asked,
+) -> None:  # fmt: skip
+    # One list's GOSPA, handed out to the objects, and its OSPA: the same pairs are the best ones for both.
+    if looked_at == 0:
+        return
+    sums.lists_looked += 1
+    unit = asked.cutoff_m**asked.power
+    localisation, pairs = gospa_pairs(
+        targets.x_m[:looked_at], targets.y_m[:looked_at], believed.x_m[:count], believed.y_m[:count],
+        asked.cutoff_m, asked.power, targets.partner[:looked_at],
+    )  # fmt: skip
+    most = max(looked_at, count)
+    sums.ospa_m += ((localisation + unit * (most - pairs)) / most) ** (1.0 / asked.power)
+    believed.paired[:count] = False
+    targets.false[:looked_at] = 0
+    for t in range(looked_at):
+        if targets.partner[t] >= 0:
+            believed.paired[targets.partner[t]] = True
+    for b in range(count):
+        if not believed.paired[b]:
+            targets.false[_nearest(believed.x_m[b], believed.y_m[b], targets, looked_at)] += 1
+    for t in range(looked_at):
+        m, b = targets.look[t], targets.partner[t]
+        located = missed = 0.0
+        if b >= 0:
+            square = (targets.x_m[t] - believed.x_m[b]) ** 2 + (targets.y_m[t] - believed.y_m[b]) ** 2
+            located = square ** (asked.power / 2)
+        else:
+            missed = unit / 2
+        false = unit / 2 * targets.false[t]
+        by_object[m].gospa_localisation += located
+        by_object[m].gospa_missed += missed
+        by_object[m].gospa_false += false
+        gospa[column[m]] = located + missed + false
+
+
+@nb.njit(cache=True, nogil=True)
+def _nearest(x_m: float, y_m: float, targets: _Targets, looked_at: int) -> int:
+    # The target nearest to a place, of equally near ones the first; −1: there are none.
+    best, least = -1, np.inf
+    for t in range(looked_at):
+        square = (targets.x_m[t] - x_m) ** 2 + (targets.y_m[t] - y_m) ** 2
+        if square < least:
+            best, least = t, square
+    return best
+
+
+@nb.njit(cache=True, nogil=True)
+def _band(edges: Float, value: float) -> int:
+    # The band that holds the value, its lower edge included, its upper one not; −1: none.
+    band = int(np.searchsorted(edges, value, side="right")) - 1
+    return band if band < len(edges) - 1 else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _row_at(world: World, time_s: float, object_ix: int) -> int:
+    # The row of an object in the frame captured then; −1: no such frame, or the object is not in it.
+    f = np.searchsorted(world.captured_s, time_s)
+    if f == len(world.captured_s) or (f > 0 and time_s - world.captured_s[f - 1] < world.captured_s[f] - time_s):
+        f -= 1
+    if f < 0 or abs(world.captured_s[f] - time_s) > _TOLERANCE_S:
+        return -1
+    there = world.object_ix[world.start[f] : world.start[f + 1]]
+    place = np.searchsorted(there, object_ix)
+    return world.start[f] + place if place < len(there) and there[place] == object_ix else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _nees(entries: Entries, i: int, east_m: float, north_m: float) -> float:
+    # eᵀ P⁻¹ e by the eigenvectors of P.
+    a, b, d = entries[i].cov_ee_m2, entries[i].cov_en_m2, entries[i].cov_nn_m2
+    half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
+    along = 0.5 * np.arctan2(2 * b, a - d)  # the direction of the larger eigenvalue
+    u, v = east_m * np.cos(along) + north_m * np.sin(along), north_m * np.cos(along) - east_m * np.sin(along)
+    return float(u * u / max(half + turn, SMALLEST_VARIANCE_M2) + v * v / max(half - turn, SMALLEST_VARIANCE_M2))

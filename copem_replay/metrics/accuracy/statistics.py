@@ -1,0 +1,196 @@
+"""How far off are the fused lists? Definitions, and statistics that add up.
+
+All is counted once per fused list, at the instant it is available, in the lists at which there is a place to measure
+distances from (the ego). Nothing is held from one list to the next, nothing weighed by time. What a *match* is, a
+*duplicate*, a *ghost*: `metrics/matching.py`. A look's *stay*: the lists from the first instant that object and ego share to the
+end of the look, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
+
+Over the matched pairs of the stay; never matched: no pairs, so nothing to average, and no say in the mean of others:
+
+- position error (m): to the truth at the list's instant, so latency counts; *at capture*: to the truth at the entry's
+  `captured_s` (not counted where there is none within 1 µs). Bias (m): entry minus truth, east and north. Velocity
+  error (m/s): length of the difference. Age (s): available minus captured. RMSE: root mean square over pairs.
+- NEES (1): eᵀ P⁻¹ e of the position, P as claimed, its eigenvalues at least 1e-9 m²; 2 on average where P is true.
+  Its 95 % band is for as many independent samples as run × object pairs with a match, for lists are not independent.
+- identity switches (1): matches by another track than the object's last match that named a track.
+
+Over a look; never matched: the worst there is:
+
+- longest time unknown (MTL, s): from onset to end it is known from a list with a match to the next list without one.
+  The last list of the stay before the onset says whether it was known at the onset; before the first list it is
+  unknown. Never matched: the whole look.
+- missed (1): lists looked at that hold no match. Duplicates (1): in lists looked at.
+
+Over all lists:
+
+- ghosts (1): of measured classes. Each goes to the nearest object looked at, if there is one.
+- GOSPA (m, α = 2, cut-off c, power p): of what is looked at in a list against the entries that belong to it, and the
+  ghosts; entries of what is not looked at now (an unmeasured object, the ego) are left out. Pairs are the best ones by
+  distance, not those of the match. dᵖ, and cᵖ/2 of a miss, are the object's part, cᵖ/2 of a false entry is the part of
+  the nearest one looked at. Mean of GOSPAᵖ over the lists in which something is looked at, to the power 1/p. Never
+  matched: cᵖ/2 in each list.
+- OSPA (m): of the same two sets; mean over the same lists.
+- existence: calibrated when of the entries with existence p the share p is of an object. In ten bins of equal width,
+  over the entries of measured classes, duplicates being of an object too. Expected calibration error: mean over the
+  entries of their bin's |share − mean existence|.
+
+Sources: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001,
+5.4 (NEES); M. P. Naeini, G. F. Cooper, M. Hauskrecht, "Obtaining well calibrated probabilities using Bayesian binning",
+AAAI 2015 (expected calibration error); GOSPA and OSPA: `metrics/gospa.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.tracks import Int
+from copem_replay.metrics.accuracy.kernel import Records
+
+EXISTENCE_BINS = 10
+"""Of equal width (chosen)."""
+
+_LISTS = [("looked", "i8"), ("missed", "i8"), ("ghosts", "i8")]
+_PAIRS = [("pairs", "i8"), ("square_m2", "f8"), ("east_m", "f8"), ("north_m", "f8"), ("nees", "f8")]
+BAND = np.dtype(_LISTS + _PAIRS)
+"""Sums of one band: lists looked at, of these missed, ghosts; pairs, Σ e², Σ of the errors east and north, Σ NEES."""
+
+OBJECT = np.dtype(
+    [
+        *_LISTS,
+        *_PAIRS,
+        ("pairs_captured", "i8"),
+        ("square_captured_m2", "f8"),
+        ("velocity_square_m2ps2", "f8"),
+        ("age_s", "f8"),
+        ("tracked", "i8"),  # pairs whose entry names a track
+        ("switches", "i8"),
+        ("duplicates", "i8"),
+        ("mtl_s", "f8"),
+        ("gospa_localisation", "f8"),  # m to the power p, as the next two
+        ("gospa_missed", "f8"),
+        ("gospa_false", "f8"),
+    ]
+)
+"""The same of one look, and further sums (`mtl_s`: the longest)."""
+
+RUN = np.dtype(
+    [
+        ("lists", "i8"),  # at which there is a place to measure from
+        ("time_s", "f8"),  # that many times the mean spacing of neighbours among them
+        ("ospa_m", "f8"),
+        ("ghosts", "i8"),
+        ("duplicates", "i8"),  # of measured objects, looked at or not
+        ("lists_looked", "i8"),  # in which something is looked at
+    ]
+)
+"""Sums of one run."""
+
+EXISTENCE = np.dtype([("entries", "i8"), ("existence", "f8"), ("with_object", "i8")])
+"""Sums of one bin of existence."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is asked for. Bands hold their lower edge, not their upper one; what is in no band is in none of their sums.
+
+    `distance_edges_m`: from the reference to the true object, or to the ghost; `time_edges_s`: of the log.
+    """
+
+    cutoff_m: float  # of GOSPA
+    power: float = 2.0
+    distance_edges_m: tuple[float, ...] = ()
+    time_edges_s: tuple[float, ...] = ()
+    existence_thresholds: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Statistics of S runs. Nothing is summed over runs, so that it does not matter how they are cut into blocks."""
+
+    settings: Settings
+    first_list: Int  # (M,) of the stay: its lists are first_list … first_list + count − 1
+    count: Int  # (M,)
+    error_m: NDArray[np.float32]  # (S, L) look after look, L = Σ count: position error; NaN: not matched
+    gospa: NDArray[np.float32]  # (S, L) the object's part of GOSPAᵖ; NaN: not looked at
+    by_object: Records  # (S, M) of OBJECT
+    by_run: Records  # (S,) of RUN
+    ghosts_at: Int  # (S, T) ghosts of at least each of the existence thresholds
+    by_distance: Records  # (S, bands) of BAND
+    by_time: Records  # (S, bands) of BAND
+    by_existence: Records  # (S, EXISTENCE_BINS) of EXISTENCE
+
+    def of_run(self, s: int) -> Accuracy:
+        """Of one run."""
+        columns: dict[str, Any] = {name: getattr(self, name)[s : s + 1] for name in _PER_RUN}
+        return replace(self, **columns)
+
+
+_PER_RUN = tuple(f.name for f in fields(Accuracy) if f.name not in ("settings", "first_list", "count"))
+
+
+def for_runs(of: Accuracy, runs: int) -> Accuracy:
+    """The same for each of `runs` runs, where one stands for all."""
+    if len(of.by_run) == runs:
+        return of
+    columns: dict[str, Any] = {
+        name: np.broadcast_to(getattr(of, name), (runs, *getattr(of, name).shape[1:])) for name in _PER_RUN
+    }
+    return replace(of, **columns)
+
+
+@dataclass(frozen=True)
+class Total:
+    """What figures are made of: sums over runs, looks and, added, logs."""
+
+    settings: Settings
+    rows: int  # looks × runs
+    matched_rows: int  # with a pair at least
+    tracked_rows: int  # with a pair at least whose entry names a track
+    looks: Any  # one OBJECT
+    runs: Any  # one RUN
+    ghosts_at: Int  # (T,)
+    by_distance: Records  # (bands,) of BAND
+    by_time: Records  # (bands,) of BAND
+    by_existence: Records  # (EXISTENCE_BINS,) of EXISTENCE
+
+    def __add__(self, other: Total) -> Total:
+        if self.settings != other.settings:
+            raise ValueError("Total: expected the same settings")
+        sums: dict[str, Any] = {}
+        for name in (f.name for f in fields(Total) if f.name != "settings"):
+            mine, others = getattr(self, name), getattr(other, name)
+            records = getattr(getattr(mine, "dtype", None), "names", None)
+            sums[name] = _summed(np.stack([mine, others])) if records else mine + others
+        return replace(self, **sums)
+
+
+def total(parts: Sequence[Accuracy]) -> Total:
+    """Sums over all runs, in their order, and looks; of blocks of runs the same as of all at once, to the last bit."""
+
+    def all_runs(name: str) -> Any:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    looks = np.concatenate([part.by_object.reshape(-1) for part in parts])
+    return Total(
+        parts[0].settings,
+        len(looks),
+        int((looks["pairs"] > 0).sum()),
+        int((looks["tracked"] > 0).sum()),
+        _summed(looks),
+        _summed(all_runs("by_run")),
+        all_runs("ghosts_at").sum(axis=0),
+        *(_summed(all_runs(name)) for name in ("by_distance", "by_time", "by_existence")),
+    )
+
+
+def _summed(records: Records) -> Records:
+    """Sums over the first axis, field by field."""
+    sums: Records = np.zeros(records.shape[1:], dtype=records.dtype)
+    for name in records.dtype.names or ():
+        sums[name] = records[name].sum(axis=0)
+    return sums

@@ -1,0 +1,215 @@
+"""Driver models: what the ego does once an object is known. They say how late and how hard, and never draw.
+
+A driver reacts after a delay and then brakes along its path; it does not steer. It is declared, not observed: a verdict
+is that of the declared driver.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from copem_replay.core.components import Component, NotNegative, Positive, Slot, asked, wrong
+from copem_replay.core.tracks import Float
+
+_SHORTEST_S = 0.05
+"""A deceleration that builds up faster than this is taken to be there at once (chosen: 5 steps)."""
+UNRESOLVED = 1e-15
+"""Shares below this are not told where only the inverse of a distribution is known: its numbers end 10⁻¹⁶ below 1."""
+
+
+class Reaction(Component, ABC):
+    """Base of reaction models: seconds from the instant a list is available until the ego begins to brake."""
+
+    @abstractmethod
+    def delays(self, uniform: Float) -> Float:
+        """(K,) seconds for uniform numbers (K,) in (0, 1): the inverse of their distribution, never decreasing."""
+
+    def survival(self, delay_s: Float) -> Float | None:
+        """(K,) probability that it takes longer than `delay_s (K,)` ≥ 0, to the far tail. None: not known.
+
+        It need not be given. With it failures rarer than 10⁻¹⁵ have a probability; `delays` has to hold for numbers
+        down to 10⁻³⁰⁰, then.
+        """
+        return None
+
+
+class ConstantReaction(Reaction):
+    """The same delay every time."""
+
+    kind: Literal["constant"] = "constant"
+    delay_s: NotNegative = 0.0
+
+    def delays(self, uniform: Float) -> Float:
+        """(K,) all the same."""
+        return np.full(len(uniform), self.delay_s)
+
+    def survival(self, delay_s: Float) -> Float:
+        """(K,) 1 before the delay, 0 from then on."""
+        return np.where(delay_s < self.delay_s, 1.0, 0.0)
+
+
+class GammaReaction(Reaction):
+    """Gamma distributed delays, by shape and mean."""
+
+    kind: Literal["gamma"] = "gamma"
+    shape: Annotated[float, Field(strict=True, ge=0.01, le=1e6)]
+    mean_s: Positive
+
+    def delays(self, uniform: Float) -> Float:
+        """(K,) quantiles of the gamma distribution."""
+        from scipy.special import gammaincinv
+
+        result: Float = gammaincinv(self.shape, uniform) * (self.mean_s / self.shape)
+        return result
+
+    def survival(self, delay_s: Float) -> Float:
+        """(K,) the upper regularised incomplete gamma function."""
+        from scipy.special import gammaincc
+
+        result: Float = gammaincc(self.shape, delay_s / (self.mean_s / self.shape))
+        return result
+
+
+class LognormalReaction(Reaction):
+    """Log-normal delays, by median and the standard deviation of their logarithm."""
+
+    kind: Literal["lognormal"] = "lognormal"
+    median_s: Positive
+    sigma: Annotated[float, Field(strict=True, ge=0, le=10)]
+
+    def delays(self, uniform: Float) -> Float:
+        """(K,) quantiles of the log-normal distribution."""
+        from scipy.special import ndtri
+
+        result: Float = self.median_s * np.exp(self.sigma * ndtri(uniform))
+        return result
+
+    def survival(self, delay_s: Float) -> Float:
+        """(K,) the normal distribution of the logarithm."""
+        from scipy.special import ndtr
+
+        if self.sigma == 0:
+            return np.where(delay_s < self.median_s, 1.0, 0.0)
+        with np.errstate(divide="ignore", over="ignore"):  # no delay, or hardly any sigma: ±∞
+            result: Float = ndtr(np.log(self.median_s / delay_s) / self.sigma)
+        return result
+
+
+REACTIONS = {
+    "constant": "copem_replay.metrics.braking.driver:ConstantReaction",
+    "gamma": "copem_replay.metrics.braking.driver:GammaReaction",
+    "lognormal": "copem_replay.metrics.braking.driver:LognormalReaction",
+}
+
+
+class Driver(Component, ABC):
+    """Base of driver models: how long it takes to react, and how hard it then brakes."""
+
+    reaction: Annotated[Reaction, Slot("reaction", REACTIONS)] = ConstantReaction()
+
+    @abstractmethod
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        """(R, T) how hard it brakes `elapsed_s (R, T)` ≥ 0 after it began to at `speed_mps (R, 1)`, ≥ 0."""
+
+
+def _resolved(build_up_s: float) -> float:
+    if 0 < build_up_s < _SHORTEST_S:
+        raise ValueError(
+            f"expected 0, or at least {_SHORTEST_S:g} s (braking is worked out every 10 ms), found {build_up_s:g}"
+        )
+    return build_up_s
+
+
+class ConstantDeceleration(Driver):
+    """Brakes with `a_max_mps2` to a stop; with `build_up_s` the deceleration grows linearly to it over that time.
+
+    With build-up the jerk is a_max / build_up, as in the careful and competent driver of UN R157, by way of esmini's
+    reading of it (docs/measures.md).
+    """
+
+    kind: Literal["constant_deceleration"] = "constant_deceleration"
+    a_max_mps2: Annotated[float, Field(strict=True, ge=0.01, le=100)]
+    build_up_s: Annotated[float, Field(strict=True, ge=0, le=100), AfterValidator(_resolved)] = 0.0
+
+    def deceleration_mps2(self, elapsed_s: Float, speed_mps: Float) -> Float:
+        """(R, T) a_max, or as much of it as is built up."""
+        if self.build_up_s == 0:
+            return np.full(elapsed_s.shape, self.a_max_mps2)
+        result: Float = self.a_max_mps2 * np.minimum(elapsed_s / self.build_up_s, 1.0)
+        return result
+
+
+DRIVERS = {"constant_deceleration": "copem_replay.metrics.braking.driver:ConstantDeceleration"}
+
+
+def delays_of(reaction: Reaction, uniform: Float) -> Float:
+    """(K,) what a reaction model says of uniform numbers (K,), checked. Raises InputError when it is no delay."""
+    where = "braking.driver.reaction"
+    found = asked(reaction, where, lambda: np.asarray(reaction.delays(uniform), dtype=float))
+    if found.shape != uniform.shape:
+        raise wrong(reaction, where, f"delays(uniform): expected shape {uniform.shape}, found {found.shape}", "delays")
+    none = ~((found >= 0) & np.isfinite(found))
+    if none.any():
+        raise wrong(reaction, where, f"delays(uniform): expected seconds ≥ 0, found {found[none][0]}", "delays")
+    return found
+
+
+_TRIED = np.array([0.01, 0.1, 0.5, 0.9, 0.99])
+"""Numbers at which the survival of a reaction is held against its delays (chosen)."""
+
+
+def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
+    """(K,) how probably a reaction takes longer than `delay_s (K,)`, checked. None: it does not say.
+
+    Raises InputError when it is no probability, or not of the delays that the same reaction gives.
+    """
+    where = "braking.driver.reaction"
+    what = "survival(delay_s)"
+
+    def survival(of_s: Float) -> Float | None:
+        given = asked(reaction, where, lambda: reaction.survival(of_s))
+        if given is None:
+            return None
+        found = asked(reaction, where, lambda: np.asarray(given, dtype=float))
+        if found.shape != of_s.shape:
+            raise wrong(reaction, where, f"{what}: expected shape {of_s.shape}, found {found.shape}", "survival")
+        none = ~((found >= 0) & (found <= 1))
+        if none.any():
+            raise wrong(reaction, where, f"{what}: expected probabilities 0 … 1, found {found[none][0]}", "survival")
+        return found
+
+    found = survival(delay_s)
+    if found is None:
+        return None
+    # Whatever the distribution, P(D > d) ≤ 1 − u ≤ P(D ≥ d): with d a hair aside for rounding.
+    at_s = delays_of(reaction, _TRIED)
+    for hair, sign in ((1e-9, 1), (-1e-9, -1)):
+        there = survival(at_s * (1 + hair))
+        assert there is not None
+        off = np.flatnonzero((sign * (there - (1 - _TRIED)) > 1e-6) & (at_s > 0))
+        if len(off):
+            k = off[0]
+            raise wrong(
+                reaction, where,
+                f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {there[k]:g}", "survival",
+            )  # fmt: skip
+    return found
+
+
+def deceleration_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
+    """(R, T) what a driver model says of `elapsed_s (R, T)` and `speed_mps (R, 1)`, checked. Raises InputError."""
+    where = "braking.driver"
+    found = asked(driver, where, lambda: np.asarray(driver.deceleration_mps2(elapsed_s, speed_mps), dtype=float))
+    method = "deceleration_mps2"
+    what = f"{method}(elapsed_s, speed_mps)"
+    if found.shape != elapsed_s.shape:
+        raise wrong(driver, where, f"{what}: expected shape {elapsed_s.shape}, found {found.shape}", method)
+    none = ~((found >= 0) & np.isfinite(found))
+    if none.any():
+        raise wrong(driver, where, f"{what}: expected m/s² ≥ 0, found {found[none][0]}", method)
+    return found

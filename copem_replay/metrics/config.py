@@ -1,0 +1,126 @@
+"""What is measured, and from when: the keys of `measure` in an experiment file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Share
+from copem_replay.perception.pem.condition import ClassNames
+
+
+class Objects(Frozen):
+    """Which objects are measured. Neither key: all moving objects but the ego."""
+
+    classes: ClassNames | None = None
+    ids: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if self.classes is not None and self.ids is not None:
+            raise ValueError("expected either classes or ids, found both")
+        return self
+
+
+class StartsMoving(Frozen):
+    """The object moves, within a distance of the ego's centre, or ahead of its front along its heading."""
+
+    kind: Literal["starts_moving"]
+    speed_mps: Positive = 0.3
+    within_m: Positive | None = None
+    from_: Annotated[Literal["centre", "front"], Field(alias="from")] = "centre"
+
+
+class Appears(Frozen):
+    """The object is in the log."""
+
+    kind: Literal["appears"]
+
+
+class InRange(Frozen):
+    """The distance to the ego is within the range."""
+
+    kind: Literal["in_range"] = "in_range"
+    range_m: Positive = 50.0
+
+
+class LineOfSight(Frozen):
+    """The ego's units see at least this share of it (`line_of_sight`), or any unit does (`line_of_sight_any`)."""
+
+    kind: Literal["line_of_sight", "line_of_sight_any"]
+    visible_share: Annotated[Share, Field(gt=0)] = 0.1
+
+
+class At(Frozen):
+    """An instant of the log."""
+
+    kind: Literal["at"]
+    time_s: NotNegative
+
+
+Onset = Annotated[StartsMoving | Appears | InRange | LineOfSight | At, Field(discriminator="kind")]
+
+
+LONGEST_CHAIN = 12
+"""More capture instants than this have no exact times (chosen: the chain has 2¹¹ states)."""
+
+Captures = Annotated[int, Field(strict=True, ge=1, le=1000)]
+
+
+class Confirm(Frozen):
+    """Detected when `hits` of the last `of` capture instants hold the object."""
+
+    hits: Captures = 1
+    of: Captures = 1
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.hits > self.of:
+            raise ValueError(f"expected hits ≤ of, found {self.hits} of {self.of}")
+        return self
+
+
+Margin = Annotated[float, Field(strict=True, ge=0, le=100)]
+"""Metres, a hundred at most (chosen: more is a mistake)."""
+
+
+class Conflict(Frozen):
+    """When a perceived state implies a collision: its predicted way meets the ego's corridor within the horizon.
+
+    The corridor is what the ego, at its present speed, will sweep of its own path, and `margin_m` around it; the object
+    is taken to keep its perceived velocity.
+    """
+
+    horizon_s: Positive = 3.0
+    margin_m: Margin = 0.5
+
+
+class Match(Frozen):
+    """How entries of fused lists are matched to true objects; `always`: those of ideal fusion and the truth, too."""
+
+    gate_m: Positive = 3.0
+    always: Flag = False
+
+
+class Gospa(Frozen):
+    """Parameters of GOSPA and OSPA (α = 2): by default the cut-off is the gate of `match`."""
+
+    cutoff_m: Positive | None = None
+    power: Annotated[float, Field(strict=True, ge=1, le=10)] = 2.0
+
+
+class Measure(Frozen):
+    """What is measured, and from when. `accuracy`: how far off the fused lists are, beside when they hold an object."""
+
+    objects: Objects = Objects()
+    onset: Onset = InRange()
+    count_earlier: Flag = False
+    confirm: Confirm = Confirm()
+    match: Match = Match()
+    distance_to: Id = "ego"
+    horizon_s: Positive | None = None
+    conflict: Conflict | None = None
+    exact: Flag = False
+    accuracy: Flag = True
+    gospa: Gospa = Gospa()

@@ -1,0 +1,1 @@
+"""When the receiver first knows of an object."""

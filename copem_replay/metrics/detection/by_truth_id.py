@@ -1,0 +1,175 @@
+"""When did the receiver first know of an object? By truth id: what a list holds is known (ideal fusion, and the truth).
+
+With ideal fusion an object is in the fused list whenever it is in a list that has arrived, so the first detection is
+read off the lists themselves; every other fusion is judged by its own lists.
+
+`confirm` counts captures, not messages: the object is confirmed when `hits` of `of` consecutive capture instants hold
+it, by the lists that have arrived. Captures of several units within half a list period are one instant. What confirms
+in the lists of one unit alone confirms also where others have joined it, whatever their rates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numba as nb
+import numpy as np
+
+from copem_replay.communication.arrivals import outrun
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
+from copem_replay.metrics.config import Confirm
+from copem_replay.metrics.episodes import Looks
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
+
+@dataclass(frozen=True)
+class Detections:
+    """When each look of Looks ended in a detection, run by run. All (S, M), NaN and −1 where not detected."""
+
+    detection_s: Float
+    captured_s: Float
+    first_unit_ix: Int
+
+
+def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool, max_age_s: float) -> Detections:
+    """First detection of every look, from the lists of all units heard (their arrival times are common to all runs).
+
+    `max_age_s` counts from capture, on top of a list's own way to the receiver.
+    """
+    heard = replace(heard, arrives_s=np.where(outrun(heard), np.inf, heard.arrives_s))
+    arrives_s = heard.arrives_s[0, heard.frame_ix]
+    captured_s = heard.row_captured_s
+    order, bounds = _by_object(heard, found, arrives_s)
+    not_before_s = np.full(len(found.object_ix), -np.inf) if count_earlier else found.onset_s - _TOLERANCE_S
+    shape = (heard.valid.shape[0], len(found.object_ix))
+    out = Detections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
+    # From when on a list is no longer gone by: at its greatest age, within a microsecond, it still is.
+    outdated_s = np.minimum(_superseded_s(heard)[heard.frame_ix], arrives_s + max_age_s + 2 * _TOLERANCE_S)
+    # One hit confirms at once, whatever the instants.
+    cluster = capture_instants(heard) if confirm.hits > 1 else np.zeros(len(heard.stamp_ns), dtype=np.int64)
+    _first(
+        heard.valid, order, bounds, arrives_s, captured_s, outdated_s, heard.row_unit_ix,
+        cluster[heard.frame_ix], heard.frame_ix, heard.frame_unit_ix,
+        not_before_s, found.ended_s + _TOLERANCE_S,
+        confirm.hits, confirm.of, out.detection_s, out.captured_s, out.first_unit_ix,
+    )  # fmt: skip
+    return out
+
+
+def capture_instants(heard: Tracks) -> Int:
+    """(F,) the capture instant each list belongs to, counted from the first; 0 for lists that never arrive.
+
+    Captures of several units within half the shortest list period of the first one are one instant; two captures of
+    one unit never are.
+    """
+    came = np.isfinite(heard.arrives_s[0])  # what never arrives is no capture to the receiver
+    reach_s = shortest_period_s(heard) / 2 + _TOLERANCE_S
+    order = np.flatnonzero(came)
+    order = order[np.argsort(heard.captured_s[order], kind="stable")]
+    cluster = np.zeros(len(came), dtype=np.int64)
+    _cluster(heard.captured_s, heard.frame_unit_ix, np.full(len(heard.units), -1), reach_s, order, cluster)
+    return cluster
+
+
+def shortest_period_s(heard: Tracks) -> float:
+    """The shortest of the units' list periods (each the median between two captures), 0 where there is none."""
+    periods = []
+    came = np.isfinite(heard.arrives_s[0])
+    for unit in np.unique(heard.frame_unit_ix[came]):
+        captured_s = np.sort(heard.captured_s[(heard.frame_unit_ix == unit) & came])
+        if len(captured_s) > 1:
+            periods.append(float(np.median(np.diff(captured_s))))
+    return min(periods, default=0.0)
+
+
+def _by_object(heard: Tracks, found: Looks, arrives_s: Float) -> tuple[Int, Int]:
+    """Rows of each look in order of arrival, then of the units: (rows,), and where each look's begin (M + 1,)."""
+    # One place more than there are objects: index −1, no truth id, is looked at by nobody.
+    look_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
+    look_of[found.object_ix] = np.arange(len(found.object_ix))
+    look = look_of[heard.row_object_ix]
+    rows = np.flatnonzero((look >= 0) & np.isfinite(arrives_s))
+    # Arrivals within a microsecond are one instant: among them the experiment's order of units decides.
+    ordered = np.unique(arrives_s[rows])
+    instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > _TOLERANCE_S)[np.searchsorted(ordered, arrives_s[rows])]
+    rows = rows[np.lexsort((heard.row_unit_ix[rows], instant, look[rows]))]
+    return rows, np.searchsorted(look[rows], np.arange(len(found.object_ix) + 1))
+
+
+def _superseded_s(heard: Tracks) -> Float:
+    """(F,) when the next list of the same unit arrives; inf for its last."""
+    result = np.full(len(heard.stamp_ns), np.inf)
+    for unit in np.unique(heard.frame_unit_ix):
+        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(heard.arrives_s[0]))
+        result[mine[:-1]] = heard.arrives_s[0, mine[1:]]
+    return result
+
+
+@nb.njit(cache=True, nogil=True)
+def _cluster(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: float, order: Int, out: Int) -> None:
+    current, first = -1, -np.inf
+    for k in order:
+        if captured_s[k] > first + reach_s or last_of[unit_ix[k]] == current:
+            current, first = current + 1, captured_s[k]
+        out[k] = last_of[unit_ix[k]] = current
+
+
+@nb.njit(cache=True, nogil=True)
+def _first(
+    valid: Bool, order: Int, bounds: Int, arrives_s: Float, captured_s: Float, outdated_s: Float, unit_ix: Int,
+    cluster: Int, frame_ix: Int, frame_unit_ix: Int, not_before_s: Float, until_s: Float, hits: int, of: int,
+    detection_s: Float, newest_s: Float, first_unit_ix: Int,
+) -> None:  # fmt: skip
+    held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
+    nobody = np.zeros(len(frame_unit_ix), dtype=np.int64)
+    # Which instants hold the object; a token per look and run spares clearing them.
+    by_instant, by_list = nobody.copy(), nobody.copy()
+    token = 0
+    for m in range(len(bounds) - 1):
+        for s in range(valid.shape[0]):
+            token += 1
+            n = 0
+            for k in range(bounds[m], bounds[m + 1]):
+                p = order[k]
+                if arrives_s[p] > until_s[m]:
+                    break
+                if not valid[s, p] or captured_s[p] < not_before_s[m]:
+                    continue
+                held[n] = p
+                n += 1
+                if hits > 1:
+                    by_instant[cluster[p]] = by_list[frame_ix[p]] = token
+                    if not (
+                        _confirmed(by_instant, token, cluster[p], hits, of, nobody)
+                        or _confirmed(by_list, token, frame_ix[p], hits, of, frame_unit_ix)
+                    ):
+                        continue
+                detection_s[s, m] = arrives_s[p]
+                first_unit_ix[s, m] = unit_ix[held[0]]
+                # The newest capture that contributes: lists that arrive at this very instant, older ones still in use.
+                newest = captured_s[p]
+                for j in range(k + 1, bounds[m + 1]):
+                    q = order[j]
+                    if arrives_s[q] > arrives_s[p] + 1e-6:
+                        break
+                    if valid[s, q]:
+                        newest = max(newest, captured_s[q])
+                for j in range(n):
+                    if outdated_s[held[j]] > arrives_s[p] + 1e-6:
+                        newest = max(newest, captured_s[held[j]])
+                newest_s[s, m] = newest
+                break
+
+
+@nb.njit(cache=True, nogil=True)
+def _confirmed(marks: Int, token: int, instant: int, hits: int, of: int, group: Int) -> bool:
+    # Do `hits` of some `of` consecutive instants of one group hold the object, this instant among them?
+    for start in range(instant - of + 1, instant + 1):
+        holding = 0
+        for i in range(max(start, 0), min(start + of, len(marks))):
+            if marks[i] == token and group[i] == group[instant]:
+                holding += 1
+        if holding >= hits:
+            return True
+    return False

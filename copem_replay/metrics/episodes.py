@@ -1,0 +1,200 @@
+"""From when, and until when, do we look at an object?
+
+Onset: the first frame at which its condition holds while the ego is in the log. The look ends at the object's own last
+frame (`object_left`: not seen by then, it is never detected), the ego's (`ego_left`) or the log's (`log_end`); only
+the last two are censoring. Source of the meanings: docs/measures.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.interpolation import states_at, wrap
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
+from copem_replay.experiment.schema import Carriers, Experiment
+from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, Measure, StartsMoving
+from copem_replay.perception.sensor_poses import carrier, moved, observers, poses, unit_ground
+from copem_replay.perception.visibility import Statics, visible_shares
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+_TOLERANCE_M = 1e-6
+ENDED_BY = ("object_left", "ego_left", "log_end")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """From where distances are measured: the ego, or a unit when there is no ego. All (K,), NaN where absent.
+
+    Its box is `length_m × width_m` around its place; a unit is a point.
+    """
+
+    x_m: Float
+    y_m: Float
+    heading_rad: Float
+    length_m: Float
+    width_m: Float
+    present: Bool
+
+
+@dataclass(frozen=True)
+class Looks:
+    """One look per measured object that has an onset. All (M,)."""
+
+    object_ix: Int
+    onset_s: Float
+    onset_at_start: Bool
+    ended_s: Float
+    ended_by: Int  # index into ENDED_BY
+
+
+def measured_objects(scene: Scene, measure: Measure) -> Int:
+    """Indices of the objects to measure, ascending: by default all moving ones but the ego."""
+    chosen = np.zeros(len(scene.object_ids), dtype=bool)
+    if measure.objects.ids is not None:
+        chosen[[scene.object_number[i] for i in measure.objects.ids if i in scene.object_number]] = True
+    elif measure.objects.classes is not None:
+        chosen = np.isin(scene.object_class, class_indices(measure.objects.classes))
+    else:
+        chosen = scene.moving.copy()
+    if scene.ego_ix >= 0:
+        chosen[scene.ego_ix] = False
+    return np.flatnonzero(chosen)
+
+
+def reference_at(scene: Scene, truth: Tracks, experiment: Experiment, time_s: Float) -> Reference:
+    """The place distances are measured from, at times (K,). Raises ExperimentError when there is none."""
+    n = len(time_s)
+    name = experiment.measure.distance_to
+    if name == "ego":
+        if scene.ego_ix < 0:
+            raise ExperimentError(
+                f"{scene.log}: no ego to measure distances from; give `ego:` or `distance_to: <unit>`"
+            )
+        at, present = _state(scene, truth, scene.ego_ix, time_s, experiment.max_gap_s)
+        return Reference(at["x_m"], at["y_m"], at["yaw_rad"], at["length_m"], at["width_m"], present)
+    unit = experiment.units[name]
+    point = np.zeros(n)
+    if unit.at is not None:
+        heading = np.full(n, np.deg2rad(unit.yaw_deg))
+        x, y = moved(np.full(n, unit.at[0]), np.full(n, unit.at[1]), heading, unit.offset_m)
+        return Reference(x, y, heading, point, point, np.ones(n, dtype=bool))
+    at, present = _state(scene, truth, carrier(scene, unit), time_s, experiment.max_gap_s)
+    x, y = moved(at["x_m"], at["y_m"], at["yaw_rad"], unit.offset_m)
+    return Reference(x, y, wrap(at["yaw_rad"] + np.deg2rad(unit.yaw_deg)), point, point, present)
+
+
+def _state(
+    scene: Scene, truth: Tracks, object_ix: int, time_s: Float, max_gap_s: float
+) -> tuple[dict[str, Float], Bool]:
+    return states_at(truth, np.full(len(time_s), object_ix), time_s, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
+
+
+def looks(scene: Scene, truth: Tracks, static: Statics, experiment: Experiment) -> Looks:
+    """Onset and end of every measured object that has an onset (`truth`: the world at its own frames)."""
+    measure = experiment.measure
+    wanted = np.isin(truth.object_ix, measured_objects(scene, measure))
+    world = truth.take_tracks(wanted)
+    ego_first_s, ego_last_s, ego_there = _ego_stay(scene, truth)
+    first_s, last_s = world.row_captured_s[world.start[:-1]], world.row_captured_s[world.start[1:] - 1]
+    if isinstance(measure.onset, At):
+        onset_s = np.full(len(first_s), measure.onset.time_s)
+        found = (onset_s >= first_s - _TOLERANCE_S) & (onset_s <= last_s + _TOLERANCE_S)
+        found &= (onset_s >= ego_first_s - _TOLERANCE_S) & (onset_s <= ego_last_s + _TOLERANCE_S)
+        at_start = onset_s <= first_s + _TOLERANCE_S
+    else:
+        possible = ego_there[world.frame_ix]
+        holds = _condition(scene, truth, wanted, world, static, experiment) & possible
+        onset_row, found = _first_true(holds, world.start)
+        first_possible, _ = _first_true(possible, world.start)
+        onset_s = world.row_captured_s[onset_row]
+        # Held already when it could first be asked: at the object's first frame that the ego shares.
+        at_start = onset_row == first_possible
+    end_s = scene.end_s
+    ended_s = np.minimum(np.minimum(last_s, ego_last_s), end_s)
+    object_left = (last_s < end_s - _TOLERANCE_S) & (last_s <= ego_last_s + _TOLERANCE_S)
+    ego_left = ~object_left & (ego_last_s < end_s - _TOLERANCE_S)
+    ended_by = np.where(object_left, 0, np.where(ego_left, 1, 2))
+    order = np.flatnonzero(found)
+    order = order[np.argsort(world.object_ix[order], kind="stable")]
+    return Looks(world.object_ix[order], onset_s[order], at_start[order], ended_s[order], ended_by[order])
+
+
+def _ego_stay(scene: Scene, truth: Tracks) -> tuple[float, float, Bool]:
+    """First and last instant of the ego, and at which frames (F,) it is there. Without an ego: the whole log."""
+    if scene.ego_ix < 0:
+        return 0.0, scene.end_s, np.ones(len(truth.stamp_ns), dtype=bool)
+    frames = truth.frame_ix[truth.row_object_ix == scene.ego_ix]
+    there = np.zeros(len(truth.stamp_ns), dtype=bool)
+    there[frames] = True
+    return float(truth.captured_s[frames[0]]), float(truth.captured_s[frames[-1]]), there
+
+
+def _first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
+    """First True row of every track (E,), and whether there is one."""
+    rows = np.flatnonzero(flags)
+    at = np.searchsorted(rows, start[:-1])
+    found = at < len(rows)
+    first = rows[np.minimum(at, len(rows) - 1)] if len(rows) else start[:-1]
+    found &= first < start[1:]
+    return np.where(found, first, start[:-1]), found
+
+
+def _condition(
+    scene: Scene, truth: Tracks, wanted: Bool, world: Tracks, static: Statics, experiment: Experiment
+) -> Bool:
+    """(P,) where the onset's condition holds, row by row of `world`, the measured tracks of `truth`."""
+    onset = experiment.measure.onset
+    if isinstance(onset, Appears):
+        return np.ones(len(world.frame_ix), dtype=bool)
+    if isinstance(onset, LineOfSight):
+        shares = _best_share(scene, truth, static, experiment, ego_only=onset.kind == "line_of_sight")
+        seen: Bool = shares[wanted[truth.track_ix]] >= onset.visible_share - 1e-9
+        return seen
+    if isinstance(onset, StartsMoving):
+        moving: Bool = np.hypot(world.vx_mps[0], world.vy_mps[0]) >= onset.speed_mps - 1e-9
+        if onset.within_m is None:
+            return moving
+        return moving & (_distance(scene, truth, world, experiment, onset.from_) <= onset.within_m + _TOLERANCE_M)
+    if isinstance(onset, InRange):
+        return _distance(scene, truth, world, experiment, "centre") <= onset.range_m + _TOLERANCE_M
+    raise TypeError(f"onset {onset!r}")
+
+
+def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: Experiment, from_: str) -> Float:
+    """(P,) distance of each row, infinite where there is nothing to measure from."""
+    per_frame = reference_at(scene, truth, experiment, truth.captured_s)
+    f = world.frame_ix
+    dx, dy = world.x_m[0] - per_frame.x_m[f], world.y_m[0] - per_frame.y_m[f]
+    if from_ == "front":
+        cos, sin = np.cos(per_frame.heading_rad[f]), np.sin(per_frame.heading_rad[f])
+        distance = np.abs(dx * cos + dy * sin - per_frame.length_m[f] / 2)
+    else:
+        distance = np.hypot(dx, dy)
+    return np.where(per_frame.present[f], distance, np.inf)
+
+
+def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: Experiment, *, ego_only: bool) -> Float:
+    """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
+
+    Units that only some runs have do not count: an onset is the same in all of them.
+    """
+    ego_carriers = {"ego", scene.object_ids[scene.ego_ix]} if scene.ego_ix >= 0 else set()
+    chosen = {
+        name: unit
+        for name, unit in experiment.units.items()
+        if not isinstance(unit.on, Carriers) and (not ego_only or unit.on in ego_carriers)
+    }
+    if not chosen:
+        return np.zeros(len(truth.frame_ix))
+    places = [poses(scene, u, truth, unit_ground(truth, n, u, [])) for n, u in chosen.items()]
+    shares = visible_shares(
+        truth,
+        static,
+        observers(places, np.array([carrier(scene, u) for u in chosen.values()])),
+        flat=experiment.visibility == "flat",
+    )
+    best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)
+    return best

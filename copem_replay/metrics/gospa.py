@@ -1,0 +1,150 @@
+"""How far is a list from the truth? GOSPA (α = 2) with its parts, and OSPA, of positions without identities.
+
+Both are metrics between finite sets of points, with a cut-off c and a power p ≥ 1. A truth and a believed object may be
+paired where they are nearer than c, and the pairs are those of least total cost:
+
+GOSPA = (Σ dᵖ + cᵖ/2 · missed + cᵖ/2 · false)^(1/p), over the pairs, the truths and the believed without a partner;
+OSPA = ((Σ dᵖ + cᵖ · (max(n, m) − pairs)) / max(n, m))^(1/p): an average, so that in a long list one error is small.
+
+One set of pairs serves both. Two empty lists are at distance 0. Letters: n truths, m believed objects.
+
+Source: A. S. Rahmathullah, Á. F. García-Fernández, L. Svensson, "Generalized optimal sub-pattern assignment metric",
+FUSION 2017; D. Schuhmacher, B.-T. Vo, B.-N. Vo, "A consistent metric for performance evaluation of multi-object
+filters", IEEE Trans. Signal Process. 56 (2008) 3447–3457.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+
+from copem_replay.core.assignment import assign, assign_pairs
+from copem_replay.core.tracks import Float, Int
+
+
+@dataclass(frozen=True)
+class Gospa:
+    """GOSPA and what it is made of: `value_m ** power == localisation + missed + false`."""
+
+    value_m: float
+    localisation: float  # Σ dᵖ of the pairs; this and the next two in metres to the power p
+    missed: float
+    false: float
+    missed_count: int
+    false_count: int
+    partner: Int  # (n,) the believed object of each truth, −1: missed
+
+
+def gospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> Gospa:
+    """GOSPA between `truth (n, 2)` and `believed (m, 2)`, metres.
+
+    Raises ValueError for other shapes, for positions that are not finite, for a cut-off not above 0, for a power
+    below 1 or infinite, and where the cut-off to that power is too large or too small a number.
+    """
+    x, y = _points("truth", truth), _points("believed", believed)
+    unit = _unit(cutoff_m, power)
+    n, m = x.shape[1], y.shape[1]
+    partner = np.empty(n, dtype=np.int64)
+    localisation, pairs = gospa_pairs(x[0], x[1], y[0], y[1], float(cutoff_m), float(power), partner)
+    missed, false = unit / 2 * (n - pairs), unit / 2 * (m - pairs)
+    value_m = (localisation + missed + false) ** (1 / power)
+    return Gospa(value_m, localisation, missed, false, n - pairs, m - pairs, partner)
+
+
+def ospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> float:
+    """OSPA between `truth (n, 2)` and `believed (m, 2)`, metres.
+
+    Of infinite power: the largest distance of a pair, where that is smallest; c where the lists differ in length.
+    Raises ValueError as `gospa` does, but for the infinite power.
+    """
+    if power == math.inf:
+        return _bottleneck(_points("truth", truth), _points("believed", believed), _unit(cutoff_m, 1.0))
+    result = gospa(truth, believed, cutoff_m=cutoff_m, power=power)
+    n = len(result.partner)
+    m = n - result.missed_count + result.false_count
+    if max(n, m) == 0:
+        return 0.0
+    alone = _unit(cutoff_m, power) * max(result.missed_count, result.false_count)
+    return float(((result.localisation + alone) / max(n, m)) ** (1 / power))
+
+
+@nb.njit(cache=True, nogil=True)
+def gospa_pairs(
+    tx: Float, ty: Float, bx: Float, by: Float, cutoff_m: float, power: float, partner: Int
+) -> tuple[float, int]:
+    """Pair truths at `tx, ty (n,)` with believed objects at `bx, by (m,)`. NaN is near to nothing; nothing is checked.
+
+    Out: `partner (n,)`, −1: missed. Gives Σ dᵖ over the pairs, and how many they are.
+    """
+    n, m = len(tx), len(bx)
+    near = 0
+    for i in range(n):
+        for j in range(m):
+            near += (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2 < cutoff_m * cutoff_m
+    row, col, cost = np.empty(near, np.int64), np.empty(near, np.int64), np.empty(near)
+    unit = cutoff_m**power
+    k = 0
+    for i in range(n):
+        for j in range(m):
+            squared = (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2
+            if squared < cutoff_m * cutoff_m:
+                row[k], col[k], cost[k] = i, j, _to_the(power, squared) - unit
+                k += 1
+    assign_pairs(row, col, cost, n, m, partner)
+    localisation, pairs = 0.0, 0
+    for i in range(n):
+        j = partner[i]
+        if j >= 0:
+            localisation += _to_the(power, (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2)
+            pairs += 1
+    return localisation, pairs
+
+
+@nb.njit(cache=True, inline="always")
+def _to_the(power: float, squared: float) -> float:
+    """A distance to the power p, from its square."""
+    if power == 2.0:
+        return squared
+    return float(np.sqrt(squared)) if power == 1.0 else float(squared ** (power / 2))
+
+
+def _bottleneck(x: Float, y: Float, cutoff_m: float) -> float:
+    """The least distance, cut off, within which everybody has a partner; points are `(2, n)` and `(2, m)`."""
+    n, m = x.shape[1], y.shape[1]
+    if n != m or n == 0:
+        return 0.0 if n == m else cutoff_m
+    distance = np.minimum(np.hypot(x[0][:, None] - y[0], x[1][:, None] - y[1]), cutoff_m)
+    partner = np.empty(n, dtype=np.int64)
+    candidates = np.unique(distance)
+    low, high = 0, len(candidates) - 1
+    while low < high:  # the most pairs within a distance: all that are near enough are worth the same
+        middle = (low + high) // 2
+        assign(np.where(distance <= candidates[middle], -1.0, np.inf), partner)
+        low, high = (low, middle) if (partner >= 0).all() else (middle + 1, high)
+    return float(candidates[low])
+
+
+def _points(name: str, points: Float) -> Float:
+    """Checked, as contiguous columns `(2, n)`."""
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"{name}: expected points (n, 2), found shape {points.shape}")
+    if not np.isfinite(points).all():
+        raise ValueError(f"{name}: expected finite positions")
+    return np.ascontiguousarray(points.T)
+
+
+def _unit(cutoff_m: float, power: float) -> float:
+    """The cut-off to the power p, checked: twice what one object without a partner costs in GOSPA."""
+    if not 0 < cutoff_m < math.inf:
+        raise ValueError(f"cutoff_m: expected a distance above 0, found {cutoff_m}")
+    if not 1 <= power < math.inf:
+        raise ValueError(f"power: expected a finite number of at least 1, found {power}")
+    with np.errstate(over="ignore", under="ignore"):
+        unit = float(np.float64(cutoff_m) ** power)
+    if not 0 < unit < math.inf:
+        raise ValueError(f"cutoff_m to the power {power}: expected a finite number above 0, found {unit}")
+    return unit

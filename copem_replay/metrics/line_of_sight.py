@@ -1,0 +1,48 @@
+"""When did somebody have the object in sight? What perception can make of it is another matter.
+
+In sight is what shows: a visible share above 0, in a list of a modelled unit, whatever its range and field of view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.metrics.episodes import Looks
+from copem_replay.perception.observation import Candidates
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
+
+def first_sights(found: Candidates, looks: Looks) -> Float:
+    """(U, M) capture of each modelled unit's first list of a look that has the object in sight; inf: none."""
+    tracks = found.tracks
+    look_of = np.full(int(max(looks.object_ix.max(initial=-1), tracks.object_ix.max(initial=-1))) + 1, -1)
+    look_of[looks.object_ix] = np.arange(len(looks.object_ix))
+    look, captured_s = look_of[tracks.row_object_ix], tracks.row_captured_s
+    rows = np.flatnonzero((look >= 0) & (found.look.visible_share > 0))
+    during = captured_s[rows] >= looks.onset_s[look[rows]] - _TOLERANCE_S
+    rows = rows[during & (captured_s[rows] <= looks.ended_s[look[rows]] + _TOLERANCE_S)]
+    first_s = np.full((len(tracks.units), len(looks.object_ix)), np.inf)
+    np.minimum.at(first_s, (tracks.row_unit_ix[rows], look[rows]), captured_s[rows])
+    return first_s
+
+
+def in_sight_s(first_s: Float, experiment: Experiment, configuration: Configuration, equipped: Bool | None) -> Float:
+    """(S | 1, M) when any unit of a configuration first has each look in sight.
+
+    NaN: never, or not known, of the truth and with recorded units. `first_s` as from `first_sights`; `equipped (S, U)`:
+    which of the experiment's units there are in each run, None: all.
+    """
+    names = experiment.units_of(configuration)
+    unknown = np.full((1, first_s.shape[1]), np.nan)
+    if not names or any(name in experiment.recorded for name in names):
+        return unknown
+    modelled, every = list(experiment.modelled), list(experiment.units)
+    mine_s = first_s[None, [modelled.index(name) for name in names]]
+    if equipped is not None:
+        there = equipped[:, [every.index(name) for name in names]]
+        mine_s = np.where(there[:, :, None], mine_s, np.inf)
+    seen_s = mine_s.min(axis=1)
+    return np.where(np.isfinite(seen_s), seen_s, np.nan)

@@ -1,0 +1,208 @@
+"""Curves, quantiles, means and intervals over many rows. Pure functions; nothing here draws a random number.
+
+*Time to detection* T: seconds from the onset to the detection, negative where the object was known before.
+Looking ends in one of three ways: the object is detected (`DETECTED`); it departs undetected (`LEFT`) and so
+is never detected, T = ∞; or we stop looking while it is still there (`CENSORED`), and of T is known only that
+it is later.
+*Cumulative incidence* F(t): the probability that T ≤ t. Departure competes with detection, it does not
+censor: F may stay below 1 for ever, and a quantile above its last value does not exist (None).
+*Restricted mean* at a horizon h: the mean of min(T, h), in which never counts as h.
+*Distance at detection*: far is good, so a row that was never detected ranks below every distance.
+*Interval*: two-sided, of a share of independent rows (`wilson`); of rows that hang together: metrics/intervals.py.
+
+Letters of the shapes: n rows, M distinct times of detection. Every function raises ValueError
+when shapes or values are not as said, or when there are no rows at all: that is a defect of the caller.
+"""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.tracks import Bool, Float
+
+CENSORED = 0
+"""The ego left or the log ended: the object was still there to be detected."""
+
+DETECTED = 1
+"""The object was detected."""
+
+LEFT = 2
+"""The object departed undetected: it is never detected."""
+
+SHARE_TOLERANCE = 1e-12
+"""A share this little below a quantile's level has reached it: 0.07 · 100 is 7, not 7.000000000000001."""
+
+
+def cumulative_incidence(
+    time_s: Float, ending: NDArray[np.integer[Any]], weight: Float | None = None, *, least: float = 1e-12
+) -> tuple[Float, Float]:
+    """Estimate the cumulative incidence of detection, departure competing: a right-continuous step function.
+
+    `time_s (n,)`: seconds from the onset to the detection, or to when looking ended; finite, may be negative.
+    `ending (n,)`: `DETECTED`, `LEFT` or `CENSORED`. Of equal times, detections and departures come before
+    censorings: who is censored at t was looked at until t, t included.
+    `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: what
+    share of all weight is still somebody, to whom the weight of the censored goes.
+
+    Returns `times_s (M,)`, the distinct times of detection, ascending, and `incidence (M,)`, the value from
+    each of them (included) to the next. Before the first it is 0, after the last it stays. Both are empty
+    when nothing was detected.
+
+    Raises ValueError for no rows, for shapes that differ, for times that are not finite, for another code.
+
+    Source: O. O. Aalen, S. Johansen, "An empirical transition matrix for non-homogeneous Markov chains based
+    on censored observations", Scand. J. Statist. 5 (1978) 141–150; one state, left for one of two others.
+    """
+    _rows(time_s, ending)
+    weight = _weights(time_s, weight)
+    if not np.isfinite(time_s).all():
+        raise ValueError("cumulative_incidence: expected finite times")
+    detected, censored = ending == DETECTED, ending == CENSORED
+    if not (detected | censored | (ending == LEFT)).all():
+        raise ValueError("cumulative_incidence: expected endings DETECTED, LEFT or CENSORED")
+    # The estimator adds S(t−)·d/r at each time of detection: d of the r still looked at are detected, S is
+    # the probability that nothing has happened yet. Between censorings r shrinks by exactly those to whom
+    # something happens, so the product S(t−) telescopes to r/n, times (r' + c)/r' for each earlier time at
+    # which c are censored and r' > 0 remain. A detection thus weighs these factors over n: whoever is
+    # censored hands his weight on, in equal parts, to all who remain. Without censoring the weights are 1
+    # and the incidence is a ratio of whole numbers, which a product over millions of times is not.
+    times_s, detections = _totals(time_s[detected], weight[detected])
+    lost_s, lost = _totals(time_s[censored], weight[censored])
+    order = np.argsort(time_s, kind="stable")
+    until = np.concatenate([[0.0], np.cumsum(weight[order])])
+    total = until[-1]
+    if total <= 0:
+        raise ValueError("cumulative_incidence: expected a weight above 0")
+    remaining = total - until[np.searchsorted(time_s[order], lost_s, side="right")]
+    # Where nobody remains, nobody takes the weight over.
+    there = remaining >= least * total * (1 - 1e-9)
+    factors = 1.0 + lost[there] / remaining[there]
+    weights = np.append(1.0, np.cumprod(factors))
+    handed = weights[np.minimum(np.searchsorted(lost_s, times_s, side="left"), len(factors))]
+    incidence = np.cumsum(detections * handed) / total
+    return times_s, np.minimum(incidence, 1.0)
+
+
+def _totals(value: Float, weight: Float) -> tuple[Float, Float]:
+    """Distinct values, ascending, and the weight on each."""
+    distinct, place = np.unique(value, return_inverse=True)
+    totals: Float = np.bincount(place, weights=weight, minlength=len(distinct)).astype(float)
+    return distinct, totals
+
+
+def _weights(rows: NDArray[Any], weight: Float | None) -> Float:
+    """(n,) how much each row counts."""
+    if weight is None:
+        return np.ones(len(rows))
+    _check_columns(rows, weight)
+    if not (weight >= 0).all():
+        raise ValueError("expected weights of at least 0")
+    return weight
+
+
+def quantile_time(times_s: Float, incidence: Float, q: float) -> float | None:
+    """Find the smallest time at which the incidence is at least `q` (to 1e-12), seconds.
+
+    None when it is never reached: the quantile falls among the never detected, or beyond what was looked at.
+    `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`, M may be 0; 0 < `q` ≤ 1.
+
+    Raises ValueError for shapes that differ or another `q`.
+    """
+    _check_columns(times_s, incidence)
+    _check_level(q)
+    first = int(np.searchsorted(incidence, q - SHARE_TOLERANCE, side="left"))
+    return float(times_s[first]) if first < len(times_s) else None
+
+
+def restricted_mean(times_s: Float, incidence: Float, horizon_s: float) -> float:
+    """Average min(T, horizon), seconds; never detected counts as the horizon. The mean may be negative.
+
+    `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`; M may be 0, the mean is then the horizon.
+    With a = min(0, earliest time) it is a + ∫ₐʰ (1 − F(t)) dt. Beyond the last time at which anyone was
+    looked at, F is not known, only held: a horizon there counts the last censored as never detected.
+
+    Raises ValueError for shapes that differ or a horizon that is not finite.
+    """
+    _check_columns(times_s, incidence)
+    if not math.isfinite(horizon_s):
+        raise ValueError(f"restricted_mean: expected a finite horizon, found {horizon_s}")
+    # F is 0 before its first step, so a drops out: what is left is h − ∫ F.
+    before = times_s < horizon_s
+    lengths_s = np.diff(np.append(times_s[before], horizon_s))
+    return float(horizon_s - incidence[before] @ lengths_s)
+
+
+def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float | None = None) -> float | None:
+    """Find the `q`-quantile of rows of which the never detected rank below every value; None: one of them.
+
+    The inverse of the empirical distribution function: the smallest value v such that the share of rows at or
+    below v, the never detected among them, is at least `q` (to 1e-12). So it is the value of some row.
+    `values (n,)`, any unit, not read where not detected and NaN only there; `detected (n,)`; 0 < `q` ≤ 1;
+    `weight (n,)`: how much each row counts, None: all alike.
+
+    Raises ValueError for no rows, for shapes that differ, for NaN where detected, for another `q`.
+    """
+    _rows(values, detected)
+    weight = _weights(values, weight)
+    _check_level(q)
+    known = values[detected]
+    if np.isnan(known).any():
+        raise ValueError("quantile_with_never: expected a value in every detected row, found NaN")
+    order = np.argsort(known, kind="stable")
+    below = np.concatenate([[weight[~detected].sum()], weight[~detected].sum() + np.cumsum(weight[detected][order])])
+    place = int(np.searchsorted(below, (q - SHARE_TOLERANCE) * weight.sum(), side="left"))
+    place = max(place, 0 if below[0] > 0 else 1)
+    return float(known[order[min(place, len(known)) - 1]]) if place > 0 else None
+
+
+def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
+    """Bound the probability of success given `successes` of `n` independent trials: (low, high), shares.
+
+    All p for which |successes/n − p| ≤ z·√(p(1 − p)/n), z the two-sided normal quantile. Low is exactly 0
+    without a success, high exactly 1 without a failure.
+
+    Raises ValueError for n < 1, `successes` outside 0 … n, `confidence` outside (0, 1).
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    J. Amer. Statist. Assoc. 22 (1927) 209–212.
+    """
+    if n < 1 or not 0 <= successes <= n:
+        raise ValueError(f"wilson: expected 0 <= successes <= n and n >= 1, found {successes} of {n}")
+    z = -NormalDist().inv_cdf(tail_of(confidence))
+    share, z2 = successes / n, z * z
+    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = z * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    # At the ends the root of the equation is 0 or 1; the difference of two rounded terms need not be.
+    low = 0.0 if successes == 0 else centre - half
+    high = 1.0 if successes == n else centre + half
+    return low, high
+
+
+def _check_columns(first: NDArray[Any], second: NDArray[Any]) -> None:
+    if first.ndim != 1 or first.shape != second.shape:
+        raise ValueError(f"expected two columns of equal length, found {first.shape} and {second.shape}")
+
+
+def _rows(first: NDArray[Any], second: NDArray[Any]) -> int:
+    """Count the rows of two columns: at least one."""
+    _check_columns(first, second)
+    if len(first) == 0:
+        raise ValueError("expected at least one row, found none")
+    return len(first)
+
+
+def _check_level(q: float) -> None:
+    if not 0.0 < q <= 1.0:
+        raise ValueError(f"expected a quantile level 0 < q <= 1, found {q}")
+
+
+def tail_of(confidence: float) -> float:
+    """Halve what a confidence leaves out: the probability beyond each limit."""
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"expected a confidence between 0 and 1, ends excluded, found {confidence}")
+    return (1.0 - confidence) / 2

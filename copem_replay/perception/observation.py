@@ -1,0 +1,234 @@
+"""Who could be listed: every object in every list of every unit, and how it looks from there.
+
+Nothing here depends on the run, on a model's parameters or on a configuration: computed once per log and shared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
+from copem_replay.core.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
+from copem_replay.core.view_geometry import Look
+from copem_replay.experiment.schema import Experiment
+from copem_replay.perception.pem.condition import applies
+from copem_replay.perception.pem.detection import probability_of
+from copem_replay.perception.sensor_poses import Placed, Poses, observers, place
+from copem_replay.perception.visibility import visible_shares
+from copem_replay.pipeline.chunking import Stretch
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """True states of all candidate rows (one run), how they look, and with which probability they are listed.
+
+    `couple_ix (P,)`: the couple of the unit's PEM that applies, −1: none. `probability (P,)`, and `existence (P,)` as
+    the unit claims it of what it lists. The units and their lists are in the experiment's order.
+    """
+
+    tracks: Tracks
+    look: Look
+    couple_ix: Int
+    probability: Float
+    existence: Float
+
+    def of_objects(self, object_ix: Int) -> Candidates:
+        """Only the rows of some objects: for what concerns each object by itself."""
+        of_track = np.isin(self.tracks.object_ix, object_ix)
+        return self if of_track.all() else self.take_rows(np.flatnonzero(of_track[self.tracks.track_ix]))
+
+    def take_rows(self, rows: Int) -> Candidates:
+        """Only some rows, ascending (K,)."""
+        return Candidates(
+            self.tracks.take_rows(rows),
+            self.look.take(rows),
+            self.couple_ix[rows],
+            self.probability[rows],
+            self.existence[rows],
+        )
+
+    @property
+    def ever_met(self) -> Bool:
+        """(U,) whether a condition of each unit's PEM is met by any object here."""
+        met = np.bincount(self.tracks.row_unit_ix[self.couple_ix >= 0], minlength=len(self.tracks.units)) > 0
+        return np.asarray(met)
+
+
+class KeptShares:
+    """Visible shares of stretches of a log, by far what takes longest of their candidates and least to keep.
+
+    Kept as long as there is room: a number of each row, where the rows themselves would be forty.
+    """
+
+    def __init__(self, room_bytes: int = 256_000_000) -> None:
+        self._room_bytes = room_bytes
+        self._kept: dict[tuple[object, ...], Float] = {}
+
+    def of(self, key: tuple[object, ...], made: Callable[[], Float]) -> Float:
+        """What was made for this key before, else what is made now."""
+        found = self._kept.get(key)
+        if found is None:
+            found = made()
+            if found.nbytes <= self._room_bytes:
+                self._room_bytes -= found.nbytes
+                self._kept[key] = found
+        return found
+
+
+def joined_stretches(pieces: Sequence[Candidates]) -> Candidates:
+    """Rows of stretches that follow each other, as of one."""
+    if len(pieces) == 1:
+        return pieces[0]
+    tracks, order = spliced([piece.tracks for piece in pieces])
+
+    def rows(columns: Sequence[Any]) -> Any:
+        return np.concatenate(columns)[order]
+
+    look = Look(**{f: rows([getattr(piece.look, f) for piece in pieces]) for f in Look.__dataclass_fields__})
+    more = (rows([getattr(piece, f) for piece in pieces]) for f in ("couple_ix", "probability", "existence"))
+    return Candidates(tracks, look, *more)
+
+
+def candidates(
+    scene: Scene,
+    truth: Tracks,
+    experiment: Experiment,
+    placed: Placed | None = None,
+    *,
+    from_s: float = -np.inf,
+    until_s: float = np.inf,
+    kept: KeptShares | None = None,
+) -> Candidates:
+    """All candidate rows of an experiment's units over one log (`truth`: the world at its own frames).
+
+    Of a stretch only the rows captured from an instant on and before another; lists are always all there. `placed`:
+    where the units are, None: to be found out. `kept`: of the same log and units.
+    """
+    if placed is None:
+        placed = place(scene, truth, experiment)
+    pieces: dict[str, tuple[Tracks, Look]] = {}
+    for names, world in _worlds(scene, truth, experiment, placed, from_s, until_s):
+        places = [placed.poses[name] for name in names]
+        carriers = np.array([placed.carrier_ix[name] for name in names])
+        flat = experiment.visibility == "flat"
+        watching = observers(places, carriers)
+        seen = partial(visible_shares, world, placed.static, watching, flat=flat)
+        shares = seen() if kept is None else kept.of((names[0], from_s, until_s), seen)
+        for k, name in enumerate(names):
+            pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
+    ordered = [pieces[name] for name in experiment.modelled]
+    tracks = joined(tuple(experiment.modelled), [piece[0] for piece in ordered])
+    look = Look(
+        **{
+            name: np.concatenate([np.empty(0), *(getattr(piece[1], name) for piece in ordered)])
+            for name in Look.__dataclass_fields__
+        }
+    )
+    look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
+    return Candidates(tracks, look, *_assess(tracks, look, experiment))
+
+
+def could_meet(scene: Scene, truth: Tracks, experiment: Experiment, placed: Placed, cut: Sequence[Stretch]) -> Bool:
+    """(U,) whether an object ever has range, azimuth and class of a condition of each unit's PEM, seen or hidden.
+
+    Without a look at who hides whom: what is never met here, no replay meets. `cut`: the stretches of the log.
+    """
+    met = dict.fromkeys(experiment.modelled, False)
+    for stretch in cut:
+        for names, world in _worlds(scene, truth, experiment, placed, stretch.from_s, stretch.until_s):
+            for name in names:
+                if met[name]:
+                    continue
+                whole = np.ones(len(world.frame_ix))
+                tracks, look = _from_unit(world, placed.poses[name], placed.carrier_ix[name], whole)
+                look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
+                pem = experiment.pems[str(experiment.units[name].pem)]
+                anyhow = (couple.when.model_copy(update={"visible_share": None}) for couple in pem)
+                met[name] = any(bool(condition.holds(look).any()) for condition in anyhow)
+        if all(met.values()):
+            break
+    return np.array(list(met.values()), dtype=bool)
+
+
+def _worlds(
+    scene: Scene, truth: Tracks, experiment: Experiment, placed: Placed, from_s: float, until_s: float
+) -> Iterator[tuple[list[str], Tracks]]:
+    """The world at the lists of the units, once for all units that have theirs at the same instants."""
+    together: dict[bytes, list[str]] = {}
+    for name, stamps in placed.stamps_ns.items():
+        together.setdefault(stamps.tobytes(), []).append(name)
+    for names in together.values():
+        if experiment.units[names[0]].rate_hz is None:
+            yield names, truth.captured_between(from_s, until_s)
+        else:
+            yield names, _world(scene, truth, placed.stamps_ns[names[0]], experiment.max_gap_s, from_s, until_s)
+
+
+def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float, from_s: float, until_s: float) -> Tracks:
+    """The world at a unit's list instants."""
+    around_s = max_gap_s + AROUND_S
+    near = truth.captured_between(from_s - around_s, until_s + around_s)
+    world = at_instants(near, stamps, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
+    return world.captured_between(from_s, until_s)
+
+
+def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple[Tracks, Look]:
+    """The candidate rows of one unit: all but its carrier, at the lists it exists for."""
+    keep = at.present[world.frame_ix] & (world.row_object_ix != carrier_ix)
+    frames = np.flatnonzero(at.present)
+    frame_number = np.cumsum(at.present) - 1
+    lengths = np.bincount(world.track_ix[keep], minlength=len(world.object_ix))
+    held = lengths > 0
+    frame = world.frame_ix[keep]
+    tracks = replace(
+        world,
+        start=np.concatenate([[0], np.cumsum(lengths[held])]),
+        unit_ix=world.unit_ix[held],
+        object_ix=world.object_ix[held],
+        frame_ix=frame_number[frame],
+        stamp_ns=world.stamp_ns[frames],
+        captured_s=world.captured_s[frames],
+        frame_unit_ix=world.frame_unit_ix[frames],
+        arrives_s=world.arrives_s[:, frames],
+        valid=world.valid[:, keep],
+        **{name: getattr(world, name)[:, keep] for name in VALUES},
+    )
+    dx, dy = tracks.x_m[0] - at.x_m[frame], tracks.y_m[0] - at.y_m[frame]
+    bearing = np.arctan2(dy, dx)
+    look = Look(
+        range_m=np.hypot(dx, dy),
+        azimuth_rad=wrap(bearing - at.heading_rad[frame]),
+        bearing_rad=bearing,
+        visible_share=share[keep],
+        class_ix=np.empty(0, dtype=np.int8),
+        length_m=tracks.length_m[0],
+        width_m=tracks.width_m[0],
+        height_m=tracks.height_m[0],
+        yaw_rad=tracks.yaw_rad[0],
+        speed_mps=np.hypot(tracks.vx_mps[0], tracks.vy_mps[0]),
+    )
+    return tracks, look
+
+
+def _assess(tracks: Tracks, look: Look, experiment: Experiment) -> tuple[Int, Float, Float]:
+    """Which couple of its unit's PEM applies to each row, the probability it gives, and the existence it claims."""
+    couple_ix = np.full(len(tracks.frame_ix), -1)
+    probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
+    for k, unit in enumerate(experiment.modelled.values()):
+        rows = np.flatnonzero(tracks.row_unit_ix == k)
+        seen = look.take(rows)
+        pem = experiment.pems[str(unit.pem)]
+        couple_ix[rows] = applies(pem, seen)
+        for c, couple in enumerate(pem):
+            mine = rows[couple_ix[rows] == c]
+            if len(mine):
+                where = f"pems.{unit.pem}[{c}].detection"
+                probability[mine] = probability_of(couple.detection, look.take(mine), where)
+                claimed = couple.existence
+                existence[mine] = look.visible_share[mine] if claimed == "visible_share" else claimed
+    return couple_ix, probability, existence

@@ -1,0 +1,95 @@
+"""A PEM: ordered couples of a condition, a detection model and an error model; the first that applies is used."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from copem_replay.core.components import Frozen, NotNegative, Number, Share, Slot
+from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, class_indices
+from copem_replay.core.view_geometry import Look
+from copem_replay.perception.pem.detection import DETECTION_MODELS, DetectionModel
+from copem_replay.perception.pem.error import ERROR_MODELS, ErrorModel
+
+_ON_THE_BOUND = 1e-9
+"""Bounds are included; a value this far outside is on the bound (metres, radians, shares)."""
+
+
+def _ascending(value: tuple[float, float]) -> tuple[float, float]:
+    if value[1] < value[0]:
+        raise ValueError(f"expected [from, to] with from ≤ to, found {list(value)}")
+    return value
+
+
+def _one_turn(value: tuple[float, float]) -> tuple[float, float]:
+    beyond = [angle for angle in value if abs(angle) > 360]
+    if beyond:
+        raise ValueError(f"expected degrees from -360 to 360, found {beyond[0]:g}")
+    return value
+
+
+def _class_name(value: str) -> str:
+    if value not in CLASSES and value not in CLASS_GROUPS:
+        known = ", ".join([*CLASSES, *CLASS_GROUPS])
+        raise ValueError(f"expected one of {known}; found {value!r}")
+    return value
+
+
+ClassName = Annotated[str, AfterValidator(_class_name)]
+ClassNames = Annotated[tuple[ClassName, ...], Field(min_length=1)]
+
+
+class Condition(Frozen):
+    """When a couple applies. All that is given must hold; bounds are included."""
+
+    range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ascending)] | None = None
+    azimuth_deg: Annotated[tuple[Number, Number], AfterValidator(_one_turn)] | None = None
+    classes: ClassNames | None = None
+    visible_share: Annotated[tuple[Share, Share], AfterValidator(_ascending)] | None = None
+
+    def holds(self, look: Look) -> Bool:
+        """(P,) where the condition holds."""
+        result = np.ones(len(look.range_m), dtype=bool)
+        if self.range_m is not None:
+            result &= _within(look.range_m, *self.range_m)
+        if self.azimuth_deg is not None:
+            first, last = np.deg2rad(self.azimuth_deg)
+            if last - first < 2 * np.pi - _ON_THE_BOUND:  # [150, −150] runs through 180
+                span = np.mod(last - first, 2 * np.pi)
+                turned = np.mod(look.azimuth_rad - first + _ON_THE_BOUND, 2 * np.pi)
+                result &= turned <= span + 2 * _ON_THE_BOUND
+        if self.classes is not None:
+            result &= np.isin(look.class_ix, class_indices(self.classes))
+        if self.visible_share is not None:
+            result &= _within(look.visible_share, *self.visible_share)
+        return result
+
+
+def _within(value: Float, low: float, high: float) -> Bool:
+    return (value >= low - _ON_THE_BOUND) & (value <= high + _ON_THE_BOUND)
+
+
+class Couple(Frozen):
+    """(d_c, p_c) under condition c: the paper's element of a PEM. Without `error` the state is exact.
+
+    `existence`: how probable the unit claims it to be that there is an object, of each entry alike (0.9 is chosen), or
+    by its visible share: the more of it is seen, the surer the unit.
+    """
+
+    when: Condition = Condition()
+    detection: Annotated[DetectionModel, Slot("detection", DETECTION_MODELS)]
+    error: Annotated[ErrorModel, Slot("error", ERROR_MODELS)] | None = None
+    existence: Share | Literal["visible_share"] = 0.9
+
+
+Pem = Annotated[tuple[Couple, ...], Field(min_length=1)]
+
+
+def applies(pem: tuple[Couple, ...], look: Look) -> Int:
+    """(P,) index of the couple that applies to each row, −1 where none does (then it is not detected)."""
+    chosen = np.full(len(look.range_m), -1)
+    for k, couple in enumerate(pem):
+        chosen[(chosen < 0) & couple.when.holds(look)] = k
+    return chosen

@@ -1,0 +1,130 @@
+"""Error models: how far off is a listed object? They scale the standard normals they are handed and never draw."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import fields
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator
+
+from copem_replay.core.components import Component, NotNegative, Number, asked, wrong
+from copem_replay.core.tracks import Float
+from copem_replay.core.view_geometry import Errors, Look, Noise
+
+
+class ErrorModel(Component, ABC):
+    """Base of error models."""
+
+    @abstractmethod
+    def perturb(self, look: Look, noise: Noise) -> Errors:
+        """Errors of every candidate row in every run, and how uncertain the unit says its entries are.
+
+        `look` has P rows, one per object and list. `noise(name)` gives (S, P) standard normals, a row of them per run:
+        one name for each independent quantity, the same numbers whenever it is asked for. No other source of chance.
+
+        Returns `Errors`, all finite:
+
+        - `east_m`, `north_m` (S, P): added to the true position, metres easting and northing.
+        - `cov_ee_m2`, `cov_en_m2`, `cov_nn_m2` (P,): the covariance that the unit claims of these, m². The same in all
+          runs. It is not checked against the errors: a model may claim more, or less, than is true.
+        - `yaw_rad` (S, P) and `yaw_var_rad2` (P,): added to the true heading, counter-clockwise.
+        - `size_m` (3, S, P) and `size_var_m2` (P,): added to length, width and height.
+        - `speed_mps` (S, P) and `speed_var_m2ps2` (P,): added to the speed along the track.
+
+        What is left out (None) is exact. Rows that no unit detects in a run are not used. Other types, shapes, NaN and
+        infinity are errors that name the model.
+        """
+
+
+def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str) -> Errors:
+    """What a model says, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
+    found = asked(model, where, lambda: model.perturb(look, noise))
+    if not isinstance(found, Errors):
+        raise wrong(model, where, f"perturb(look, noise): expected Errors, found {type(found).__name__}", "perturb")
+    n = len(look.range_m)
+    for field in fields(found):
+        values = getattr(found, field.name)
+        if values is None:
+            continue
+        variance = field.name.startswith("cov_") or "_var_" in field.name
+        expected = (n,) if variance else (3, runs, n) if field.name == "size_m" else (runs, n)
+        shape = np.shape(values)
+        if shape != expected:
+            raise wrong(model, where, f"perturb: {field.name}: expected shape {expected}, found {shape}", "perturb")
+        if not np.isfinite(values).all():
+            raise wrong(model, where, f"perturb: {field.name}: expected numbers, found NaN or infinity", "perturb")
+    return found
+
+
+Pair = tuple[Number, Number]
+
+
+def _covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
+    (a, b), (c, d) = value
+    scale = max(abs(a), abs(d), 1e-12)
+    if abs(b - c) > 1e-9 * scale:
+        raise ValueError(f"expected a symmetric matrix, found {b} and {c} off the diagonal")
+    if a < 0 or d < 0 or a * d - b * c < -1e-9 * scale**2:
+        raise ValueError(f"expected a positive semi-definite matrix, found [[{a}, {b}], [{c}, {d}]]")
+    return value
+
+
+Covariance = Annotated[tuple[Pair, Pair], AfterValidator(_covariance)]
+
+
+class Gaussian(ErrorModel):
+    """Gaussian errors with full covariance.
+
+    `frame: absolute` (the paper's): covariance and mean in easting and northing. `frame: line_of_sight`: along and
+    across the line from the unit to the object (across: to its left), rotated to easting and northing.
+    Optional standard deviations of yaw, of size (length, width and height independently) and of speed along the track.
+    """
+
+    kind: Literal["gaussian"] = "gaussian"
+    covariance_m2: Covariance
+    mean_m: Pair = (0.0, 0.0)
+    frame: Literal["absolute", "line_of_sight"] = "absolute"
+    yaw_sigma_deg: NotNegative = 0.0
+    size_sigma_m: NotNegative = 0.0
+    speed_sigma_mps: NotNegative = 0.0
+
+    def perturb(self, look: Look, noise: Noise) -> Errors:
+        """Offsets = mean + L·z with L·Lᵀ the covariance, turned into easting and northing."""
+        (a, b), (_, d) = self.covariance_m2
+        l11 = np.sqrt(a)
+        # What rounding leaves of a singular matrix may not be blown up: no row is longer than its variance says.
+        l21 = float(np.clip(b / l11, -np.sqrt(d), np.sqrt(d))) if l11 > 0 else 0.0
+        l22 = np.sqrt(max(d - l21 * l21, 0.0))
+        z1, z2 = noise("position 1"), noise("position 2")
+        first = self.mean_m[0] + l11 * z1
+        second = self.mean_m[1] + l21 * z1 + l22 * z2
+        n = len(look.range_m)
+        if self.frame == "absolute":
+            east, north = first, second
+            ee, en, nn = np.full(n, a), np.full(n, b), np.full(n, d)
+        else:
+            cos, sin = np.cos(look.bearing_rad), np.sin(look.bearing_rad)
+            east, north = cos * first - sin * second, sin * first + cos * second
+            ee = cos * cos * a - 2 * cos * sin * b + sin * sin * d
+            en = cos * sin * (a - d) + (cos * cos - sin * sin) * b
+            nn = sin * sin * a + 2 * cos * sin * b + cos * cos * d
+
+        def spread(name: str, sigma: float) -> tuple[Float | None, Float | None]:
+            return (sigma * noise(name), np.full(n, sigma**2)) if sigma > 0 else (None, None)
+
+        yaw, yaw_var = spread("yaw", np.deg2rad(self.yaw_sigma_deg))
+        speed, speed_var = spread("speed", self.speed_sigma_mps)
+        size, size_var = None, None
+        if self.size_sigma_m > 0:
+            size = self.size_sigma_m * np.stack([noise("length"), noise("width"), noise("height")])
+            size_var = np.full(n, self.size_sigma_m**2)
+        return Errors(
+            east, north, ee, en, nn,
+            yaw_rad=yaw, yaw_var_rad2=yaw_var, size_m=size, size_var_m2=size_var,
+            speed_mps=speed, speed_var_m2ps2=speed_var,
+        )  # fmt: skip
+
+
+ERROR_MODELS = {"gaussian": "copem_replay.perception.pem.error:Gaussian"}

@@ -1,0 +1,140 @@
+"""What can be seen from where: the visible share of an upright box, exact to rounding.
+
+`surface`: uniform in azimuth over the target's angular extent; at each azimuth the share of the column of the
+target's nearest face, bottom to top, that no body in front of it covers. `flat`: the same with infinitely high
+bodies. A body whose footprint overlaps the target's does not hide it; a unit inside the target's footprint sees 1; a
+unit inside another body ignores that body; a unit's own carrier neither hides nor is seen. (The contract's definition.)
+The integration is in perception/visibility_kernel.py.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.core.tracks import Bool, Float, Int, Tracks
+from copem_replay.perception.visibility_kernel import views
+
+_ROWS_PER_THREAD = 20_000
+"""Below this many views a thread costs more than it brings (chosen)."""
+
+
+@dataclass(frozen=True)
+class Statics:
+    """Static obstacles as convex parts: `xy_m (V, 2)` counter-clockwise, parts `start (G + 1,)`.
+
+    `body (G,)` says which obstacle a part belongs to; `bottom_m`, `top_m (G,)` are heights in the world.
+    """
+
+    xy_m: Float
+    start: Int
+    body: Int
+    bottom_m: Float
+    top_m: Float
+
+
+def statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m: Sequence[float]) -> Statics:
+    """Static obstacles from simple polygons, each (K, 2), convex or not, any order of corners."""
+    import shapely
+
+    parts: list[Float] = []
+    body: list[int] = []
+    for k, corners in enumerate(polygons):
+        polygon = shapely.orient_polygons(shapely.Polygon(corners))
+        convex = polygon.convex_hull.area - polygon.area <= 1e-9 * polygon.area
+        pieces = [polygon.convex_hull] if convex else shapely.constrained_delaunay_triangles(polygon).geoms
+        for piece in pieces:
+            parts.append(np.array(shapely.orient_polygons(piece).exterior.coords)[:-1])
+            body.append(k)
+    index = np.array(body, dtype=np.int64)
+    bottom = np.array(bottom_m, dtype=float)
+    return Statics(
+        xy_m=np.concatenate([*parts, np.empty((0, 2))]),
+        start=np.concatenate([[0], np.cumsum([len(p) for p in parts])]).astype(np.int64),
+        body=index,
+        bottom_m=bottom[index],
+        top_m=(bottom + np.array(height_m, dtype=float))[index],
+    )
+
+
+NO_STATICS = Statics(
+    np.empty((0, 2)), np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
+)
+
+
+@dataclass(frozen=True)
+class Observers:
+    """Where units are at each list of a world: `place_m (U, F, 3)`, whether they are there `present (U, F)`.
+
+    `carrier_ix (U,)`: the object that carries each, −1: none.
+    """
+
+    place_m: Float
+    present: Bool
+    carrier_ix: Int
+
+
+def visible_shares(
+    world: Tracks, static: Statics, observers: Observers, *, flat: bool, threads: int | None = None
+) -> Float:
+    """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier."""
+    order, _bounds = world.by_frame
+    seen, _blocker = _views(world, static, observers, flat, threads, blockers=False)
+    shares = np.empty_like(seen)
+    shares[:, order] = seen
+    return shares
+
+
+def hidden_by(world: Tracks, static: Statics, observers: Observers, *, flat: bool, threads: int | None = None) -> Int:
+    """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
+
+    −1: none hides any of it; −2 − k: the obstacle k.
+    """
+    order, _bounds = world.by_frame
+    _seen, found = _views(world, static, observers, flat, threads, blockers=True)
+    blocker = np.empty_like(found)
+    blocker[:, order] = np.where(found >= 0, order[found], found) if len(order) else found
+    return blocker
+
+
+def _views(
+    world: Tracks, static: Statics, observers: Observers, flat: bool, threads: int | None, *, blockers: bool
+) -> tuple[Float, Int]:
+    """Shares and blockers (U, P), rows list by list; blockers empty unless asked for."""
+    order, bounds = world.by_frame
+    n_units, n_frames = observers.present.shape
+    out = np.full((n_units, len(order)), np.nan)
+    blocker = np.full((n_units, len(order)) if blockers else (0, 0), -1)
+    if not len(order):
+        return out, blocker
+    z, half = world.z_m[0, order], world.height_m[0, order] / 2
+    arrays = (
+        bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order],
+        static.xy_m, static.start, static.body, static.bottom_m, static.top_m,
+        np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present), observers.carrier_ix, flat,
+    )  # fmt: skip
+    threads = threads or min(8, os.cpu_count() or 1)
+    pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
+    # Cuts with about as many rows each, so that threads end together.
+    cuts = np.searchsorted(bounds, np.linspace(0, len(order), pieces + 1)[1:-1])
+    edges = [0, *sorted(int(c) for c in cuts), n_frames]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda k: views(edges[k], edges[k + 1], *arrays, out, blocker), range(pieces)))
+    return out, blocker
+
+
+def box_corners(tracks: Tracks) -> Float:
+    """Corners of the boxes' footprints in the first run, counter-clockwise: (P, 4, 2)."""
+    return rectangles(tracks.x_m[0], tracks.y_m[0], tracks.yaw_rad[0], tracks.length_m[0], tracks.width_m[0])
+
+
+def rectangles(x_m: Float, y_m: Float, yaw_rad: Float, length_m: Float, width_m: Float) -> Float:
+    """Corners of rectangles, counter-clockwise: (P, 4, 2)."""
+    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
+    forward = length_m[:, None] / 2 * np.array([1.0, -1.0, -1.0, 1.0])
+    left = width_m[:, None] / 2 * np.array([1.0, 1.0, -1.0, -1.0])
+    return np.stack([x_m[:, None] + cos * forward - sin * left, y_m[:, None] + sin * forward + cos * left], axis=-1)

@@ -1,0 +1,400 @@
+"""The compiled kernel of perception/visibility.py: see there for what it computes.
+
+How: between the azimuths of two neighbouring corners, the inverse distance to the face a ray enters by (or leaves
+by) is linear in the ray's direction u, so the slope at which each body begins and ends to cover is linear in u too.
+Slopes are equal where a linear function of u vanishes: these azimuths are found in closed form and split the interval.
+What is left is a smooth ratio of two linear functions, integrated with three Gauss points.
+
+All in one file, because Numba's cache on disk only notices changes in the file of the function it compiled.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from copem_replay.core.tracks import Bool, Float, Int
+
+Work = tuple[Float, Float, Float, Float, Float, Float, Float]
+
+_OVERLAP_M = 1e-6
+"""Footprints that enter each other by less than this only touch (chosen)."""
+_MAX_PIECES = 512
+"""Azimuth pieces per view (chosen): 60 bodies in front of one target need about 250."""
+
+
+@nb.njit(cache=True, nogil=True)
+def views(
+    f0: int, f1: int, bounds: Int, corners: Float, bottom: Float, top: Float, object_ix: Int,
+    static_xy: Float, static_start: Int, static_body: Int, static_bottom: Float, static_top: Float,
+    observer_m: Float, present: Bool, carrier_ix: Int, flat: bool, out: Float, blocker: Int,
+) -> None:  # fmt: skip
+    """Visible shares `out (U, P)` of the lists f0 … f1 − 1; rows P list by list, `bounds (F + 1,)` their starts.
+
+    `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
+    hides any of it, −2 − k for the obstacle k.
+    """
+    # Bodies of one list: the boxes first, then the static parts. Everything below is relative to the observer.
+    n_static = len(static_body)
+    most = n_static
+    for f in range(f0, f1):
+        most = max(most, bounds[f + 1] - bounds[f] + n_static)
+    widest = 4
+    for g in range(n_static):
+        widest = max(widest, static_start[g + 1] - static_start[g])
+    xy = np.empty((most, widest, 2))
+    size = np.empty(most, dtype=np.int64)
+    middle = np.empty((most, 2))
+    radius = np.empty(most)
+    zlo, zhi = np.empty(most), np.empty(most)
+    owner = np.empty(most, dtype=np.int64)
+    # From one observer: bearing and distance of the middle, extent in azimuth, whether it can hide anything.
+    bearing, distance, lo, hi = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
+    hides, inside = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
+    near, alone = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
+    work = _workspace(most, widest)
+
+    for f in range(f0, f1):
+        first = bounds[f]
+        n = bounds[f + 1] - first
+        bodies = n + n_static
+        for b in range(bodies):
+            if b < n:
+                size[b], owner[b] = 4, -1
+                zlo[b], zhi[b] = bottom[first + b], top[first + b]
+                for k in range(4):
+                    xy[b, k, 0], xy[b, k, 1] = corners[first + b, k, 0], corners[first + b, k, 1]
+            else:
+                g = b - n
+                size[b], owner[b] = static_start[g + 1] - static_start[g], static_body[g]
+                zlo[b], zhi[b] = static_bottom[g], static_top[g]
+                for k in range(size[b]):
+                    v = static_start[g] + k
+                    xy[b, k, 0], xy[b, k, 1] = static_xy[v, 0], static_xy[v, 1]
+            mx = my = r2 = 0.0
+            for k in range(size[b]):
+                mx += xy[b, k, 0] / size[b]
+                my += xy[b, k, 1] / size[b]
+            for k in range(size[b]):
+                r2 = max(r2, (xy[b, k, 0] - mx) ** 2 + (xy[b, k, 1] - my) ** 2)
+            middle[b, 0], middle[b, 1], radius[b] = mx, my, np.sqrt(r2)
+
+        for u in range(present.shape[0]):
+            if not present[u, f]:
+                continue
+            ox, oy, oz = observer_m[u, f, 0], observer_m[u, f, 1], observer_m[u, f, 2]
+            for b in range(bodies):
+                inside[b] = _contains(xy[b], size[b], ox, oy)
+                hides[b] = not inside[b] and not (b < n and object_ix[first + b] == carrier_ix[u])
+                dx, dy = middle[b, 0] - ox, middle[b, 1] - oy
+                bearing[b], distance[b] = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
+                lo[b] = hi[b] = 0.0
+                if hides[b]:
+                    for k in range(size[b]):
+                        vx, vy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
+                        angle = np.arctan2(dx * vy - dy * vx, dx * vx + dy * vy)
+                        lo[b], hi[b] = min(lo[b], angle), max(hi[b], angle)
+            for b in range(n, bodies):  # inside one part of an obstacle is inside the obstacle
+                if inside[b]:
+                    for c in range(n, bodies):
+                        if owner[c] == owner[b]:
+                            hides[c] = False
+            for t in range(n):
+                if object_ix[first + t] == carrier_ix[u]:
+                    continue
+                if inside[t]:
+                    out[u, first + t] = 1.0
+                    continue
+                count = 0
+                for b in range(bodies):
+                    if b == t or not hides[b] or distance[b] - radius[b] > distance[t] + radius[t]:
+                        continue
+                    turn = bearing[b] - bearing[t]
+                    turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
+                    if (
+                        (turn + lo[b] < hi[t] and turn + hi[b] > lo[t])
+                        or turn + hi[b] - 2 * np.pi > lo[t]
+                        or turn + lo[b] + 2 * np.pi < hi[t]
+                    ):
+                        near[count] = b
+                        count += 1
+                count = _drop_overlapping(t, near, count, xy, size, middle, radius, owner)
+                if count == 0:
+                    out[u, first + t] = 1.0
+                else:
+                    out[u, first + t] = _share(
+                        t, near, count, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work
+                    )
+                if blocker.shape[0] == 0:
+                    continue
+                least = 1.0 - 1e-9
+                for i in range(count):
+                    alone[0] = near[i]
+                    left = _share(t, alone, 1, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work)
+                    if left < least:
+                        least = left
+                        blocker[u, first + t] = first + near[i] if near[i] < n else -2 - owner[near[i]]
+
+
+@nb.njit(inline="always")
+def _contains(polygon: Float, size: int, px: float, py: float) -> bool:
+    for k in range(size):
+        m = k + 1 if k + 1 < size else 0
+        ex, ey = polygon[m, 0] - polygon[k, 0], polygon[m, 1] - polygon[k, 1]
+        if ex * (py - polygon[k, 1]) - ey * (px - polygon[k, 0]) < 0.0:
+            return False
+    return True
+
+
+@nb.njit(cache=True, nogil=True)
+def _separated(a: Float, na: int, b: Float, nb_: int) -> bool:
+    # An edge of a with all of b on its outer side (or touching it).
+    for k in range(na):
+        m = k + 1 if k + 1 < na else 0
+        ex, ey = a[m, 0] - a[k, 0], a[m, 1] - a[k, 1]
+        reach = np.sqrt(ex * ex + ey * ey) * _OVERLAP_M
+        outside = True
+        for j in range(nb_):
+            if ex * (b[j, 1] - a[k, 1]) - ey * (b[j, 0] - a[k, 0]) > reach:
+                outside = False
+                break
+        if outside:
+            return True
+    return False
+
+
+@nb.njit(cache=True, nogil=True)
+def _drop_overlapping(
+    t: int, near: Int, count: int, xy: Float, size: Int, middle: Float, radius: Float, owner: Int
+) -> int:
+    # A body that overlaps the target's footprint does not hide it; one part that overlaps frees the whole obstacle.
+    kept = 0
+    freed = -1
+    for i in range(count):
+        b = near[i]
+        dx, dy, reach = middle[b, 0] - middle[t, 0], middle[b, 1] - middle[t, 1], radius[b] + radius[t]
+        overlaps = (
+            dx * dx + dy * dy < reach * reach
+            and not _separated(xy[t], size[t], xy[b], size[b])
+            and not _separated(xy[b], size[b], xy[t], size[t])
+        )
+        if not overlaps:
+            near[kept] = b
+            kept += 1
+        elif owner[b] >= 0:
+            freed = owner[b]
+            for j in range(i + 1, count):  # the parts still to come …
+                if owner[near[j]] == freed:
+                    near[j] = t  # … marked: the target never hides itself
+            back = 0
+            for j in range(kept):  # … and those already kept
+                if owner[near[j]] != freed:
+                    near[back] = near[j]
+                    back += 1
+            kept = back
+    if freed < 0:
+        return kept
+    final = 0
+    for j in range(kept):
+        if near[j] != t:
+            near[final] = near[j]
+            final += 1
+    return final
+
+
+@nb.njit(cache=True, nogil=True)
+def _workspace(most: int, widest: int) -> Work:
+    return (
+        np.empty((most + 1, widest, 2)),  # corners in the frame of the view: observer at 0, target along +x
+        np.empty(most * widest + widest + 2),  # azimuths of corners
+        np.empty((most, 2)), np.empty((most, 2)),  # slopes at which each active body begins and ends to cover, as g·u
+        np.empty(_MAX_PIECES),  # azimuths where two slopes are equal
+        np.empty(most), np.empty(most),  # covered intervals of one column
+    )  # fmt: skip
+
+
+@nb.njit(inline="always")
+def _faces(polygon: Float, size: int, ux: float, uy: float) -> tuple[bool, float, float, float, float, float]:
+    # Inverse distances of entry and exit along u, as vectors g with 1/d = g·u; hit is False where the ray misses.
+    enter, leave = -np.inf, np.inf
+    nx = ny = fx = fy = 0.0
+    hit = True
+    for k in range(size):
+        m = k + 1 if k + 1 < size else 0
+        ax, ay = polygon[k, 0], polygon[k, 1]
+        ex, ey = polygon[m, 0] - ax, polygon[m, 1] - ay
+        offset = ey * ax - ex * ay  # outward normal (ey, −ex) times a point of the edge
+        speed = ey * ux - ex * uy
+        # Zero where the observer stands in line with the edge: then it is not the face that is seen.
+        nearness = 1.0 / offset if offset != 0.0 else 0.0
+        if speed < 0.0:
+            d = offset / speed
+            if d > enter:
+                enter, nx, ny = d, ey * nearness, -ex * nearness
+        elif speed > 0.0:
+            d = offset / speed
+            if d < leave:
+                leave, fx, fy = d, ey * nearness, -ex * nearness
+        elif offset < 0.0:
+            hit = False
+    return hit and enter < leave and leave > 0.0, enter, nx, ny, fx, fy
+
+
+@nb.njit(cache=True, nogil=True)
+def _insert(values: Float, count: int, value: float) -> int:
+    # Keeps values[:count] ascending.
+    k = count
+    while k > 0 and values[k - 1] > value:
+        values[k] = values[k - 1]
+        k -= 1
+    values[k] = value
+    return count + 1
+
+
+@nb.njit(inline="always")
+def _equal_at(
+    gx: float, gy: float, a: float, b: float, cos_a: float, sin_a: float, cos_b: float, sin_b: float
+) -> float:
+    # The azimuth within (a, b) at which g·u = 0, else a.
+    va, vb = gx * cos_a + gy * sin_a, gx * cos_b + gy * sin_b
+    if va * vb >= 0.0:
+        return a
+    va, vb = abs(va), abs(vb)
+    at = np.arctan2(sin_a * vb + sin_b * va, cos_a * vb + cos_b * va)
+    return float(min(max(at, a), b))
+
+
+@nb.njit(cache=True, nogil=True)
+def _share(
+    t: int, near: Int, count: int, xy: Float, size: Int, zlo: Float, zhi: Float,
+    ox: float, oy: float, oz: float, bearing: float, lo: float, hi: float, flat: bool, work: Work,
+) -> float:  # fmt: skip
+    # The share of target t that the bodies near[:count] leave visible: the open azimuths, column by column.
+    local, breaks, begin, end, splits, low, high = work
+    cos, sin = np.cos(bearing), np.sin(bearing)
+    n_breaks = _insert(breaks, 0, lo)
+    n_breaks = _insert(breaks, n_breaks, hi)
+    for i in range(count + 1):  # the target last
+        b = near[i] if i < count else t
+        for k in range(size[b]):
+            dx, dy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
+            vx, vy = cos * dx + sin * dy, cos * dy - sin * dx
+            local[i, k, 0], local[i, k, 1] = vx, vy
+            angle = np.arctan2(vy, vx)
+            if lo < angle < hi:
+                n_breaks = _insert(breaks, n_breaks, angle)
+    z0, z1 = zlo[t] - oz, zhi[t] - oz
+    seen = 0.0
+    for piece in range(n_breaks - 1):
+        a, b = breaks[piece], breaks[piece + 1]
+        if b - a < 1e-12:
+            continue
+        ux, uy = np.cos((a + b) / 2), np.sin((a + b) / 2)
+        hit, face, tx, ty, _fx, _fy = _faces(local[count], size[t], ux, uy)
+        if not hit:  # rounding at a grazing corner
+            continue
+        active = _active(
+            near, count, local, size, zlo, zhi, oz, ux, uy, face, tx, ty, z0, z1, a, b, flat, begin, end
+        )  # fmt: skip
+        if active == 0:
+            seen += b - a
+        elif active > 0:
+            n_splits = _split(active, begin, end, tx, ty, z0, z1, a, b, splits)
+            for k in range(n_splits - 1):
+                width = splits[k + 1] - splits[k]
+                if width < 1e-12:
+                    continue
+                for g in range(3):
+                    theta = splits[k] + width * (0.5 + (g - 1) * 0.3872983346207417)  # √0.15: Gauss–Legendre
+                    weight = (8.0 if g == 1 else 5.0) / 18.0
+                    seen += width * weight * _open(active, begin, end, tx, ty, z0, z1, theta, low, high)
+    return float(min(max(seen / (hi - lo), 0.0), 1.0))
+
+
+@nb.njit(inline="always")
+def _active(
+    near: Int, count: int, local: Float, size: Int, zlo: Float, zhi: Float, oz: float, ux: float, uy: float,
+    face: float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, flat: bool, begin: Float, end: Float,
+) -> int:  # fmt: skip
+    # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in begin and end.
+    # −1 where one of them covers all of it. Linear in u: what holds at both ends holds throughout.
+    cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    tx0, ty0, tx1, ty1 = z0 * tx, z0 * ty, z1 * tx, z1 * ty
+    active = 0
+    for i in range(count):
+        body = near[i]
+        hit, enter, nx, ny, fx, fy = _faces(local[i], size[body], ux, uy)
+        if not hit or enter >= face:
+            continue
+        if flat:
+            return -1
+        bottom, top = zlo[body] - oz, zhi[body] - oz
+        # It begins to cover at its lower edge: the near one where that is below the eyes, else the far one.
+        bx, by = (bottom * nx, bottom * ny) if bottom < 0.0 else (bottom * fx, bottom * fy)
+        ex, ey = (top * nx, top * ny) if top > 0.0 else (top * fx, top * fy)
+        below = (bx - tx0) * cos_a + (by - ty0) * sin_a <= 0 and (bx - tx0) * cos_b + (by - ty0) * sin_b <= 0
+        above = (ex - tx1) * cos_a + (ey - ty1) * sin_a >= 0 and (ex - tx1) * cos_b + (ey - ty1) * sin_b >= 0
+        if below and above:
+            return -1
+        under = (ex - tx0) * cos_a + (ey - ty0) * sin_a <= 0 and (ex - tx0) * cos_b + (ey - ty0) * sin_b <= 0
+        over = (bx - tx1) * cos_a + (by - ty1) * sin_a >= 0 and (bx - tx1) * cos_b + (by - ty1) * sin_b >= 0
+        if not (under or over):
+            begin[active, 0], begin[active, 1], end[active, 0], end[active, 1] = bx, by, ex, ey
+            active += 1
+    return active
+
+
+@nb.njit(cache=True, nogil=True)
+def _split(
+    active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, splits: Float
+) -> int:
+    # The azimuths from a to b between which no slope crosses another, nor an end of the column; how many.
+    cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    n_splits = _insert(splits, 0, a)
+    n_splits = _insert(splits, n_splits, b)
+    for i in range(active):
+        for edge in range(2):
+            gx = begin[i, 0] if edge == 0 else end[i, 0]
+            gy = begin[i, 1] if edge == 0 else end[i, 1]
+            for other in range(-2, 2 * active):
+                if other < 0:
+                    z = z0 if other == -2 else z1
+                    hx, hy = z * tx, z * ty
+                elif other // 2 <= i:
+                    continue
+                elif other % 2 == 0:
+                    hx, hy = begin[other // 2, 0], begin[other // 2, 1]
+                else:
+                    hx, hy = end[other // 2, 0], end[other // 2, 1]
+                at = _equal_at(gx - hx, gy - hy, a, b, cos_a, sin_a, cos_b, sin_b)
+                if at > a and n_splits < _MAX_PIECES:
+                    n_splits = _insert(splits, n_splits, at)
+    return n_splits
+
+
+@nb.njit(inline="always")
+def _open(
+    active: int, begin: Float, end: Float, tx: float, ty: float, z0: float, z1: float, theta: float,
+    low: Float, high: Float,
+) -> float:  # fmt: skip
+    # The share of the column at one azimuth that is not covered: 1 less the union of the bodies' intervals.
+    ux, uy = np.cos(theta), np.sin(theta)
+    inverse = tx * ux + ty * uy
+    n_covered = 0
+    for i in range(active):
+        first = max(((begin[i, 0] * ux + begin[i, 1] * uy) / inverse - z0) / (z1 - z0), 0.0)
+        last = min(((end[i, 0] * ux + end[i, 1] * uy) / inverse - z0) / (z1 - z0), 1.0)
+        if last <= first:
+            continue
+        j = n_covered
+        while j > 0 and low[j - 1] > first:
+            low[j], high[j] = low[j - 1], high[j - 1]
+            j -= 1
+        low[j], high[j] = first, last
+        n_covered += 1
+    left, reach = 1.0, 0.0
+    for i in range(n_covered):
+        if high[i] > reach:
+            left -= high[i] - max(low[i], reach)
+            reach = high[i]
+    return left

@@ -1,0 +1,190 @@
+"""Exact detection times: their distribution in closed form, without a single draw.
+
+Lists are independent given the truth, and with ideal fusion an object is known when any list that has arrived holds it:
+P(T > t) = Π (1 − p) over all lists that have arrived by t. Confirmation by k of n is a Markov chain over the last n − 1
+capture instants where all units capture together and their lists arrive together; elsewhere it has no such form, and is
+refused. Both are worked out in metrics/log_survival.py. With the reaction's distribution follow the probabilities to pass and to
+fail. docs/measures.md has the definitions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Float, Int, Tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.braking.driver import Reaction
+from copem_replay.metrics.braking.verdict import fail_probability, pass_probability
+from copem_replay.metrics.detection.by_truth_id import capture_instants
+from copem_replay.metrics.detections_table import distances
+from copem_replay.metrics.episodes import ENDED_BY
+from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
+from copem_replay.pipeline.expansion import fleet_of
+from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.receiver import by_truth, listen
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
+
+def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
+    """The rows of `exact.parquet` of one log: per configuration and object, how probable each time of detection is.
+
+    Raises ExperimentError for a configuration that has no closed form.
+    """
+    braking = experiment.braking
+    if braking is not None and braking.brakes_for == "conflict":
+        raise ExperimentError(
+            f"{replay.scene.log}: exact: perceived conflicts depend on sampled errors, and `brakes_for: "
+            "conflict` has no closed form; use `brakes_for: object`, or leave `exact` out"
+        )
+    _check_truth_ids(experiment)
+    parts = []
+    for name in experiment.configurations:
+        columns = _columns(replay, experiment, name, distributions(replay, experiment, name))
+        if braking is not None:
+            columns |= _passing(replay, columns, braking.driver.reaction)
+        parts.append(pd.DataFrame(columns).drop(columns="look"))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _check_truth_ids(experiment: Experiment) -> None:
+    """Raises ExperimentError for a configuration of which it is not known how probable its detections are."""
+    for name, configuration in experiment.configurations.items():
+        recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
+        if not by_truth(configuration) or experiment.measure.match.always:
+            why = "what is matched with the truth depends on sampled errors"
+        elif recorded:
+            why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"
+        else:
+            continue
+        raise ExperimentError(f"exact: configuration {name}: {why}, which has no closed form; leave `exact` out")
+
+
+def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
+    """Raises ExperimentError for a configuration that has no closed form."""
+    if not experiment.measure.exact:
+        return
+    _check_truth_ids(experiment)
+    if experiment.measure.confirm.hits == 1:
+        return
+    for replay in ready:
+        units = fleet_of(experiment, replay.scene).experiment
+        for name, configuration in units.configurations.items():
+            _shared_instants(replay, listen(replay.measured.tracks, replay.truth, units, configuration), name)
+
+
+def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
+    """For each look when it is first known."""
+    experiment = fleet_of(experiment, replay.scene).experiment
+    configuration, looks, confirm = experiment.configurations[name], replay.looks, experiment.measure.confirm
+    heard = listen(replay.measured.tracks, replay.truth, experiment, configuration)
+    # A model of the user's own may be above 1 by rounding.
+    listed = (
+        np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
+    )
+    instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
+    arrives_s = heard.arrives_s[0, heard.frame_ix]
+    by_object = np.argsort(heard.row_object_ix, kind="stable")
+    first, last = (np.searchsorted(heard.row_object_ix[by_object], looks.object_ix, side) for side in ("left", "right"))
+    result = []
+    for m in range(len(looks.object_ix)):
+        rows = by_object[first[m] : last[m]]
+        counts = arrives_s[rows] <= looks.ended_s[m] + _TOLERANCE_S
+        if not experiment.measure.count_earlier:
+            counts &= heard.row_captured_s[rows] >= looks.onset_s[m] - _TOLERANCE_S
+        rows = rows[counts]
+        if instants is None:
+            share = replay.fleet.share if configuration.units != TRUTH else np.ones(1)
+            result.append(first_of(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share))
+        else:
+            instant = instants[heard.frame_ix[rows]]
+            result.append(confirmed(instant, arrives_s[rows], listed[rows], confirm.hits, confirm.of))
+    return result
+
+
+def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
+    """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
+    came = np.isfinite(heard.arrives_s[0])
+    if heard.units != (TRUTH,) and (replay.fleet.share[heard.frame_unit_ix[came]] < 1).any():
+        raise ExperimentError(
+            f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
+            "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
+        )
+    instants = capture_instants(heard)
+    everyone = np.unique(instants[came])
+    for unit in np.unique(heard.frame_unit_ix[came]):
+        mine = came & (heard.frame_unit_ix == unit)
+        if not np.array_equal(np.unique(instants[mine]), everyone):
+            raise ExperimentError(
+                f"{replay.scene.log}: exact: configuration {name}: unit {heard.units[unit]} does not list at "
+                "every instant at which another does, and confirmation over such lists has no closed form; give all "
+                "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
+            )
+    for instant in everyone:
+        arrivals = heard.arrives_s[0, came & (instants == instant)]
+        if np.ptp(arrivals) > _TOLERANCE_S:
+            raise ExperimentError(
+                f"{replay.scene.log}: exact: configuration {name}: lists captured together arrive up to "
+                f"{np.ptp(arrivals):g} s apart, and confirmation over such lists has no closed form; give all units "
+                "one latency, confirm with one hit, or leave `exact` out"
+            )
+    return instants
+
+
+def _columns(replay: Replay, experiment: Experiment, name: str, distributions: list[FirstKnown]) -> dict[str, Any]:
+    """Columns of one configuration: a row per look and instant, and for each look one, without instant, for never."""
+    scene, looks = replay.scene, replay.looks
+    look = np.repeat(np.arange(len(distributions)), [len(of.time_s) + 1 for of in distributions])
+
+    def rows(pieces: Iterable[Float]) -> Float:
+        return np.concatenate([np.empty(0), *pieces])
+
+    def of_never(values: Iterable[float]) -> Float:
+        return rows(np.append(np.full(len(of.time_s), np.nan), v) for of, v in zip(distributions, values, strict=True))
+
+    detection_s = rows(np.append(of.time_s, np.nan) for of in distributions)
+    object_ix = looks.object_ix[look]
+    distance_m, gap_m = distances(scene, replay.truth, experiment, object_ix, detection_s)
+    return {
+        "log": scene.log,
+        "configuration": name,
+        "look": look,
+        "object_id": np.array(scene.object_ids, dtype=object)[object_ix],
+        "object_class": np.array(CLASSES, dtype=object)[scene.object_class[object_ix]],
+        "onset_s": looks.onset_s[look],
+        "detection_s": detection_s,
+        "probability": rows(np.append(of.probability, np.exp(of.log_never)) for of in distributions),
+        "incidence": rows(np.append(np.minimum(np.cumsum(of.probability), 1), np.nan) for of in distributions),
+        "miss_log10": of_never(_log10(of.log_never) for of in distributions),
+        "miss_per_logit": of_never(of.per_logit for of in distributions),
+        "miss_log10_half_odds": of_never(_log10(of.log_never_half) for of in distributions),
+        "time_to_detection_s": detection_s - looks.onset_s[look],
+        "distance_at_detection_m": distance_m,
+        "gap_at_detection_m": gap_m,
+        "ended_s": looks.ended_s[look],
+        "ended_by": np.array(ENDED_BY, dtype=object)[looks.ended_by[look]],
+    }
+
+
+def _log10(log: float) -> float:
+    """Of a natural logarithm; NaN where that is −inf, as detection is certain."""
+    return log / math.log(10) if log > -np.inf else np.nan
+
+
+def _passing(replay: Replay, columns: Mapping[str, Any], reaction: Reaction) -> dict[str, Any]:
+    """Whether each row's look is in conflict, and the probabilities to pass and to fail if it is detected then."""
+    look = columns["look"]
+    detection_s = columns["detection_s"]
+    known_s = np.where(np.isnan(detection_s), np.inf, np.maximum(detection_s, replay.looks.onset_s[look]))
+    passes, fails = np.full(len(look), np.nan), np.full(len(look), np.nan)
+    for number, between in replay.passing_s.items():
+        rows = np.flatnonzero(look == number)
+        passes[rows] = pass_probability(between, known_s[rows], reaction)
+        fails[rows] = fail_probability(between, known_s[rows], reaction)
+    return {"conflict": ~np.isnan(passes), "pass_probability": passes, "fail_probability": fails}

@@ -1,0 +1,185 @@
+"""Believe: what the receiver makes of what it hears, configuration by configuration (f of the paper's coPEM)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from copem_replay.communication.arrivals import Instants, instants
+from copem_replay.communication.link import transmit
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.object_list import Lists
+from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
+from copem_replay.fusion.ideal import draw_posterior, fuse
+from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
+from copem_replay.io.recorded_units import RecordedUnits
+from copem_replay.perception.observation import Candidates
+from copem_replay.perception.perceive import perceive
+from copem_replay.pipeline.chunking import WHOLE, Stretch
+from copem_replay.pipeline.conversions import as_lists
+
+States = Literal["true", "expected", "sampled"]
+
+
+@dataclass(frozen=True)
+class World:
+    """One log, or a stretch of one, as the units of an experiment have it: what of it is the same in all runs.
+
+    `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
+    unit per carrier. What was captured before the stretch and is needed in it is there, too.
+    """
+
+    scene: Scene
+    truth: Tracks
+    found: Candidates
+    recorded: RecordedUnits | None
+    experiment: Experiment
+    stretch: Stretch = WHOLE
+
+
+@dataclass(frozen=True)
+class Believed:
+    """What one configuration's receiver believes in the runs (S,) at its instants, `at`.
+
+    `belief`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without truth ids,
+    or what another fusion gave; one run where all runs agree.
+    """
+
+    heard: Tracks
+    at: Instants
+    belief: Belief | None
+    scene: Scene
+    fused: Lists | None
+
+    @cached_property
+    def lists(self) -> Lists:
+        """The fused lists without truth ids."""
+        if self.fused is not None:
+            return self.fused
+        assert self.belief is not None
+        return as_lists(self.belief, self.scene)
+
+
+def seen_by_all(world: World, runs: Int, *, states: States, equipped: Bool | None = None) -> Tracks:
+    """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`."""
+    experiment = world.experiment
+    if equipped is not None:
+        equipped = equipped[:, [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]]
+    seen = perceive(world.scene, world.found, experiment, runs, states=states, equipped=equipped)
+    if world.recorded is None:
+        return seen
+    recorded = world.recorded.tracks
+    recorded = replace(recorded, valid=np.broadcast_to(recorded.valid, (len(runs), len(recorded.frame_ix))))
+    both = joined((*seen.units, *recorded.units), [seen, recorded])
+    # In the experiment's order: it decides between lists that arrive together.
+    names = tuple(experiment.units)
+    place = np.array([names.index(name) for name in both.units])
+    return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
+
+
+def listen(
+    seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration, there: Bool | None = None
+) -> Tracks:
+    """What reaches the receiver in one configuration: the lists of its units, late; those of the others never.
+
+    `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn
+    for them.
+    """
+    if configuration.units == TRUTH:
+        return transmit(truth, configuration.latency_of)
+    heard = set(experiment.units_of(configuration))
+    if there is not None:
+        heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
+    return transmit(seen, lambda unit: configuration.latency_of(unit) if unit in heard else np.inf)
+
+
+def by_truth(configuration: Configuration) -> bool:
+    """Whether what a configuration believes has truth ids: the truth itself, and ideal fusion."""
+    return configuration.units == TRUTH or isinstance(configuration.fusion, Ideal)
+
+
+class Receivers:
+    """The receivers of all configurations, of the units that are `there (U,)`, and what they remember.
+
+    Stretches of one log are believed one after the other, in order of time.
+    """
+
+    def __init__(self, runs: Int, there: Bool | None) -> None:
+        self._runs, self._there = runs, there
+        self._instants: dict[str, Instants] = {}
+        self._memory: dict[str, Any] = {}
+
+    def issue_s(self, name: str) -> Float:
+        """(K,) all instants of a configuration's receiver, when it has been heard of."""
+        return self._instants[name].issue_s
+
+    def believe(self, world: World) -> Iterator[tuple[str, Believed]]:
+        """What each configuration's receiver believes in the runs (S,), in the stretch.
+
+        Raises InputError where a fusion of the user's own fails.
+        """
+        experiment = world.experiment
+        seen: dict[States, Tracks] = {}  # each is made when first needed
+        without_truth: list[Lists] = []
+
+        def seen_in(states: States) -> Tracks:
+            if states not in seen:
+                seen[states] = seen_by_all(world, self._runs, states=states)
+            return seen[states]
+
+        for name, configuration in experiment.configurations.items():
+            fusion, of_truth = configuration.fusion, configuration.units == TRUTH
+            max_age_s = configuration.max_age_s
+            posterior = isinstance(fusion, Ideal) and fusion.combine == "posterior" and not of_truth
+            states: States = "expected" if posterior else "sampled"
+            heard = listen(seen_in(states), world.truth, experiment, configuration, self._there)
+            if name not in self._instants:
+                self._instants[name] = instants(heard, max_age_s=max_age_s)
+            at = self._instants[name].between(world.stretch.from_s, world.stretch.until_s)
+            if isinstance(fusion, ListFusion):
+                if not without_truth:
+                    without_truth.append(_without_truth(world, seen_in("sampled"), self._runs))
+                told = reports(heard, without_truth[0], max_age_s=max_age_s, at=at)
+                where = f"configurations.{name}.fusion"
+                if fusion.resumable:
+                    fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
+                else:  # such a log is one stretch
+                    fused = fused_by(fusion, told, where)
+                yield name, Believed(heard, at, None, world.scene, fused)
+                continue
+            belief = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
+            if not of_truth and world.recorded is None:
+                belief = replace(belief, look=world.found.look)
+            if posterior:
+                belief = draw_posterior(belief, world.scene, experiment.seed, self._runs)
+            yield name, Believed(heard, at, belief, world.scene, None)
+
+
+def believe(world: World, runs: Int, there: Bool | None) -> Iterator[tuple[str, Believed]]:
+    """What each configuration's receiver believes of a whole log."""
+    return Receivers(runs, there).believe(world)
+
+
+def _without_truth(world: World, seen: Tracks, runs: Int) -> Lists:
+    """The units' lists as a real fusion sees them: no truth ids, and in no order that means anything."""
+    found, recorded = world.found, world.recorded
+    words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]
+    existence = found.existence
+    likely = np.eye(len(CLASSES))[found.look.class_ix]
+    track_id = np.full(len(words), -1)
+    if recorded is not None:
+        words = np.concatenate([words, np.arange(len(recorded.existence), dtype=np.uint64)])
+        existence = np.concatenate([existence, recorded.existence])
+        likely = np.concatenate([likely, recorded.class_probability])
+        track_id = np.concatenate([track_id, recorded.track_id])
+    address = Address(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
+    drawn = Dice(world.experiment.seed, world.scene.log).uniform("order in the list", address, runs)
+    claims = Claims(existence, likely, track_id)
+    return lists_without_truth(seen, claims, drawn, without_object_ix=world.scene.ego_ix)

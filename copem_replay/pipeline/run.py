@@ -1,0 +1,196 @@
+"""Run: experiment × logs × blocks of runs → results folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.fixed import fixed_in
+from copem_replay.metrics.summary import horizon_s, summary
+from copem_replay.pipeline import log_replay as replays
+from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
+from copem_replay.pipeline.closed_form import check_exact, exact_table
+from copem_replay.pipeline.cost import Cost, watched
+from copem_replay.pipeline.log_replay import Outcome, Replay
+from copem_replay.pipeline.memory import memory_notes
+from copem_replay.pipeline.oddities import oddities
+from copem_replay.pipeline.sweep import Point, points, without_points
+
+Progress = Callable[[int, int], None]
+"""`progress(done, total)`, called after each block of runs."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one experiment gave."""
+
+    table: pd.DataFrame  # detections.parquet
+    summary: pd.DataFrame  # summary.csv
+    notes: tuple[str, ...]  # what has to be said, one line each
+    replays: tuple[Replay, ...]  # one per log
+    horizon_s: float | None
+    exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
+    accuracy: AccuracyTables | None = None  # with `measure: {accuracy: true}`
+    sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
+    costs: tuple[str, ...] = ()  # what has to be said on the terminal alone: no two runs take the same time
+
+
+def run(
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    *,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    ready: Sequence[Replay] | None = None,
+) -> Result:
+    """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks.
+
+    `ready`: the logs as they were prepared and checked before. Raises ExperimentError before any run: something that
+    has no closed form, runs that no memory holds.
+    """
+    with watched() as cost:
+        if ready is None:
+            ready = [replays.prepare(recording, experiment) for recording in recordings]
+            check_closed_form(ready, experiment)
+            memory_notes(ready, experiment)
+        tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)), cost)
+        result = _run(experiment, recordings, ready, tables)
+    return replace(result, costs=cost.notes())
+
+
+def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables) -> Result:
+    exact = _exactly(ready, experiment)
+    table, parts, order = tables.of(ready, experiment)
+    horizon = horizon_s(table, experiment.measure.horizon_s)
+    rows, said = summary(
+        table,
+        list(experiment.configurations),
+        _rates(ready, experiment),
+        seed=experiment.seed,
+        horizon_s=horizon,
+        exact=exact,
+        accuracy=totals(parts),
+        fixed=fixed_in(experiment.as_written()),
+    )
+    swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
+    notes = notes_of(recordings, ready, experiment, replayed=True)
+    sweep = pd.concat(swept, ignore_index=True) if swept else None
+    accuracy = None
+    if experiment.measure.accuracy and len(experiment.configurations):
+        accuracy = accuracy_tables(parts, order, same_units=_same_units(ready))
+    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
+
+
+def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
+    """Raises ExperimentError where exact times are asked for, also along a sweep, and there are none."""
+    check_exact(ready, experiment)
+    for point in points(experiment):
+        if point.same_units:
+            check_exact(ready, point.experiment)
+
+
+def notes_of(
+    recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
+) -> list[str]:
+    """What has to be said of the recordings, and of them and the experiment together: after a replay, or before."""
+    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
+    for replay in ready:
+        met = replay.ever_met if replayed else None
+        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
+    notes += without_points(experiment)
+    if experiment.measure.accuracy and not _same_units(ready):
+        notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+    return notes
+
+
+def _same_units(ready: Sequence[Replay]) -> bool:
+    """Whether all runs have the same units."""
+    return all(bool((replay.fleet.share == 1).all()) for replay in ready)
+
+
+def _at_point(
+    point: Point, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables, horizon: float | None
+) -> pd.DataFrame:
+    """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
+    experiment = point.experiment
+    if not point.same_units:
+        ready = [replays.prepare(recording, experiment) for recording in recordings]
+    table, parts, _ = tables.of(ready, experiment)
+    rows, _ = summary(
+        table,
+        list(experiment.configurations),
+        _rates(ready, experiment),
+        seed=experiment.seed,
+        horizon_s=horizon,
+        exact=_exactly(ready, experiment),
+        accuracy=totals(parts),
+        fixed=fixed_in(experiment.as_written()),
+    )
+    rows.insert(0, "sweep", point.sweep)
+    rows.insert(1, "value", point.value)
+    return rows
+
+
+def _exactly(ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame | None:
+    if not experiment.measure.exact:
+        return None
+    return pd.concat([exact_table(replay, experiment) for replay in ready], ignore_index=True)
+
+
+class _Tables:
+    """Tables of all logs and runs, computed in blocks by several workers; tells how far it is."""
+
+    def __init__(self, jobs: int, progress: Progress | None, tables: int, cost: Cost) -> None:
+        self._jobs, self._progress, self._tables, self._done, self._cost = jobs, progress, tables, 0, cost
+
+    def of(
+        self, ready: Sequence[Replay], experiment: Experiment
+    ) -> tuple[pd.DataFrame, list[Outcome], NDArray[np.int64]]:
+        """The rows of `detections.parquet` of an experiment; all outcomes, and the order their rows have got."""
+        work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, self._jobs)]
+        parts: list[list[Outcome]] = []
+        pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
+        try:
+            for part in pool.map(lambda item: replays.outcomes(item[0], experiment, item[1]), work):
+                parts.append(part)
+                if self._progress is not None:
+                    self._progress(self._done * len(work) + len(parts), self._tables * len(work))
+        finally:  # interrupted: what has not begun never does
+            pool.shutdown(cancel_futures=True)
+        self._done += 1
+        every = [outcome for part in parts for outcome in part]
+        self._cost.add(time.perf_counter() - began_s, every)
+        table = pd.concat([with_accuracy(outcome) for outcome in every], ignore_index=True)
+        order = _order(table, [replay.scene.log for replay in ready], experiment)
+        return table.iloc[order].reset_index(drop=True), every, order
+
+
+def _order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> NDArray[np.int64]:
+    """The order (n,) of rows by log, configuration, run and object, however the runs were cut into blocks."""
+    log = table["log"].map({name: k for k, name in enumerate(logs)}).to_numpy()
+    configuration = table["configuration"].map({n: k for k, n in enumerate(experiment.configurations)}).to_numpy()
+    return np.lexsort((table["run"].to_numpy(), configuration, log))
+
+
+def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float | None]:
+    rates = [replays.list_rates(replay, experiment) for replay in ready]
+    return {name: _rate([of_log[name] for of_log in rates]) for name in experiment.configurations}
+
+
+def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:
+    count, span_s = sum(n for n, _ in intervals), sum(s for _, s in intervals)
+    return count / span_s if span_s > 0 else None
+
+
+def log_path_of(recordings: Sequence[Recording], log: str) -> Path:
+    """Where a log lies."""
+    return next(recording.path for recording in recordings if recording.scene.log == log)

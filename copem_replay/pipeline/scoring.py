@@ -1,0 +1,163 @@
+"""Appraise: how good were a configuration's fused lists? Matched with the truth at the instant each was available."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from copem_replay.core.agree import AGREE
+from copem_replay.core.interpolation import AROUND_S, at_instants
+from copem_replay.core.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
+from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_runs
+from copem_replay.metrics.config import Measure
+from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
+from copem_replay.metrics.detection.by_truth_id import Detections
+from copem_replay.metrics.episodes import Looks, Reference, measured_objects, reference_at
+from copem_replay.metrics.matching import Matches, match
+from copem_replay.pipeline.receiver import Believed
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """One log's truth at the instants of fused lists. What configurations share is computed once."""
+
+    scene: Scene
+    truth: Tracks
+    experiment: Experiment
+    _worlds: dict[bytes, Tracks] = field(default_factory=dict)
+    _references: dict[bytes, Reference] = field(default_factory=dict)
+
+    def at(self, time_s: Float) -> Tracks:
+        """The truth at instants (K,), ascending."""
+        key = time_s.tobytes()
+        if key not in self._worlds:
+            stamps = self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
+            gap_s = self.experiment.max_gap_s
+            near = self.truth
+            if len(time_s):
+                near = near.captured_between(time_s[0] - gap_s - AROUND_S, time_s[-1] + gap_s + AROUND_S)
+            self._worlds[key] = at_instants(near, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
+        return self._worlds[key]
+
+    def reference(self, time_s: Float) -> Reference:
+        """From where distances are measured, at instants (K,)."""
+        key = time_s.tobytes()
+        if key not in self._references:
+            self._references[key] = reference_at(self.scene, self.truth, self.experiment, time_s)
+        return self._references[key]
+
+    def classes(self, measure: Measure) -> Bool:
+        """(C,) which classes are measured: only of these are entries that nothing true belongs to ghosts."""
+        measured: Bool = np.zeros(len(CLASSES), dtype=bool)
+        measured[self.scene.object_class[measured_objects(self.scene, measure)]] = True
+        if measure.objects.ids is None and measure.objects.classes is not None:
+            measured[class_indices(measure.objects.classes)] = True
+        # A `vehicle`, not said which, may be a car; what is not classified at all may be anything.
+        alike: Bool = np.array(AGREE[:, measured].any(axis=1))
+        alike[CLASSES.index("other")] = measured[CLASSES.index("other")]
+        return alike
+
+    def since_s(self, looks: Looks) -> Float:
+        """(M,) when each object that is looked at first is in the log."""
+        first = np.full(len(self.scene.object_ids), np.inf)
+        np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
+        since: Float = first[looks.object_ix]
+        return since
+
+
+@dataclass(frozen=True)
+class Appraisal:
+    """Of one configuration in the runs (S,), or in the one that stands for all.
+
+    `issue_s (K,)`: when each list was available. `detections` and `steps`: as matches tell, whatever the fusion.
+    """
+
+    issue_s: Float
+    detections: Detections
+    steps: Steps
+    accuracy: Accuracy | None
+
+
+def match_lists(around: Surroundings, believed: Believed, measure: Measure) -> Matches:
+    """Which true object each entry of the fused lists is about."""
+    return match(believed.lists, around.at(believed.at.issue_s), around.scene, gate_m=measure.match.gate_m)
+
+
+class Appraiser:
+    """Measures a configuration's lists, stretch by stretch; `issue_s (K,)`: when all of the log's are available."""
+
+    def __init__(
+        self, around: Surroundings, looks: Looks, believed: Believed, issue_s: Float, measure: Measure
+    ) -> None:
+        self._issue_s, self._measure = issue_s, measure
+        self.accuracy_s = 0.0
+        """How long measuring accuracy took, matching not counted."""
+        runs = len(believed.lists.start)
+        self._known = FirstMatches(
+            looks, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
+            captures=captures_of(believed.heard),
+        )  # fmt: skip
+        self._captures: Float = np.unique(believed.heard.captured_s)
+        self._assessment = None
+        if measure.accuracy:
+            self._assessment = Assessment(
+                issue_s, around.scene, looks, around.since_s(looks), around.reference(issue_s),
+                around.classes(measure), settings=settings_of(measure, around.scene.end_s), runs=runs,
+            )  # fmt: skip
+
+    def add(self, around: Surroundings, believed: Believed) -> Matches:
+        """Take in the lists of a stretch; what they are about."""
+        matches = match_lists(around, believed, self._measure)
+        lists, issue_s = believed.lists, believed.at.issue_s
+        self._known.add(lists, matches, issue_s)
+        if self._assessment is not None:
+            began_s = time.perf_counter()
+            whole = len(issue_s) == len(self._issue_s)
+            captures = self._captures if whole else self._next_to(lists.entries["captured_s"])
+            self._assessment.add(lists, matches, around.at(issue_s), around.at(captures))
+            self.accuracy_s += time.perf_counter() - began_s
+        return matches
+
+    def _next_to(self, captured_s: Float) -> Float:
+        """The captures that are next to instants (N,), before and after."""
+        after = np.searchsorted(self._captures, captured_s)
+        used = np.zeros(len(self._captures) + 1, dtype=bool)
+        used[after] = used[np.maximum(after - 1, 0)] = True
+        return self._captures[used[:-1]]
+
+    def result(self, runs: int) -> Appraisal:
+        """All of it, for each of so many runs."""
+        detections, steps = self._known.result()
+        assessment = self._assessment
+        accuracy = None if assessment is None else for_runs(assessment.result(), runs)
+        return Appraisal(self._issue_s, detections, steps, accuracy)
+
+
+DISTANCE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
+"""Of bands of distance (chosen)."""
+
+TIME_BANDS = 120
+"""At most so many bands of time, of whole seconds (chosen)."""
+
+EXISTENCE_THRESHOLDS = (
+    0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.89, 0.91, 0.95,
+    0.98, 0.992, 0.9992, 0.99992, 0.999992,
+)  # fmt: skip
+"""At which ghosts are counted (chosen: the last ones tell two, three, … units of existence 0.9 from fewer)."""
+
+
+def settings_of(measure: Measure, end_s: float) -> Settings:
+    """Parameters of the accuracy for a log that ends at `end_s`."""
+    cutoff_m = measure.gospa.cutoff_m if measure.gospa.cutoff_m is not None else measure.match.gate_m
+    step_s = max(1, int(np.ceil(end_s / TIME_BANDS)))
+    return Settings(
+        cutoff_m,
+        measure.gospa.power,
+        DISTANCE_EDGES_M,
+        tuple(float(edge) for edge in range(0, int(end_s) + 1 + step_s, step_s)),
+        EXISTENCE_THRESHOLDS,
+    )

@@ -1,0 +1,159 @@
+"""Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
+
+A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `share` the units themselves.
+Configurations that it leaves as they are, or makes equal to one before, are left out. A latency is varied only where
+there is one (above 0, or by unit) or where the configuration is named: who hears of nobody over the air has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from copem_replay.core.tracks import TRUTH
+from copem_replay.experiment.schema import Carriers, Configuration, Experiment, SweptBy, Unit
+from copem_replay.metrics.config import Measure
+
+KINDS = ("latency_s", "rate_hz", "units", "share")
+
+
+@dataclass(frozen=True)
+class Point:
+    """One value of one sweep: `experiment` at that value, with the configurations it changes."""
+
+    sweep: str
+    value: float
+    experiment: Experiment
+
+    @property
+    def same_units(self) -> bool:
+        """Whether what is prepared for the experiment serves this point, too."""
+        return self.sweep in ("latency_s", "units")
+
+
+def points(experiment: Experiment) -> Iterator[Point]:
+    """The points of all sweeps of an experiment, sweep by sweep in the order of their values."""
+    if experiment.sweep is None:
+        return
+    for kind in KINDS:
+        values = getattr(experiment.sweep, kind) or ()
+        curves = _curves(experiment, kind, values)
+        for k, value in enumerate(values):
+            at = experiment.model_copy(
+                update={
+                    "configurations": {name: c for name, curve in curves.items() if (c := curve[k]) is not None},
+                    "units": _units_at(experiment.units, kind, value),
+                    "sweep": None,
+                    "measure": _measured(experiment),
+                }
+            )
+            if at.configurations:
+                yield Point(kind, float(value), at)
+
+
+def resolved(experiment: Experiment) -> Experiment:
+    """The same experiment with `sweep.configurations` said: the list, or one for each quantity where they differ."""
+    sweep = experiment.sweep
+    if sweep is None or isinstance(sweep.configurations, tuple):
+        return experiment
+    swept = {kind: values for kind in KINDS if (values := getattr(sweep, kind))}
+    names = {
+        kind: sweep.chosen(kind)
+        or tuple(name for name, curve in _curves(experiment, kind, values).items() if any(curve))
+        for kind, values in swept.items()
+    }
+    first, *others = names.values()
+    if not any(names.values()):
+        return experiment
+    alike = all(other == first for other in others)
+    said = first if alike else SweptBy(**{kind: of_kind for kind, of_kind in names.items() if of_kind})
+    return experiment.model_copy(update={"sweep": sweep.model_copy(update={"configurations": said})})
+
+
+def without_points(experiment: Experiment) -> list[str]:
+    """Sweeps of an experiment that no configuration is changed by, and what would help."""
+    if experiment.sweep is None:
+        return []
+    there = {point.sweep for point in points(experiment)}
+    none = [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in there]
+    return [f"sweep of {kind}: it changes no configuration{_unstated(experiment, kind)}" for kind in none]
+
+
+def _unstated(experiment: Experiment, kind: str) -> str:
+    assert experiment.sweep is not None
+    heard = [c for c in experiment.configurations.values() if c.units != TRUTH and not c.latency_s]
+    if kind != "latency_s" or experiment.sweep.chosen(kind) or not heard:
+        return ""
+    return "; none states a latency above 0 or by unit, and `sweep: {configurations: […]}` does not name any"
+
+
+def _measured(experiment: Experiment) -> Measure:
+    """Perceived conflicts take time, and are not asked for unless somebody brakes for them; accuracy never is."""
+    needed = experiment.braking is not None and experiment.braking.brakes_for == "conflict"
+    conflict = experiment.measure.conflict if needed else None
+    return experiment.measure.model_copy(update={"conflict": conflict, "accuracy": False})
+
+
+def _curves(
+    experiment: Experiment, kind: str, values: tuple[float, ...]
+) -> dict[str, tuple[Configuration | None, ...]]:
+    """What becomes of each configuration at each value; None: it has no such value."""
+    curves: dict[str, tuple[Configuration | None, ...]] = {}
+    assert experiment.sweep is not None
+    chosen = experiment.sweep.chosen(kind)
+    for name, configuration in experiment.configurations.items():
+        # A latency that is not above 0 is one only where it is given by unit, or the configuration is named.
+        wanted = name in chosen if chosen is not None else kind != "latency_s" or bool(configuration.latency_s)
+        if not wanted or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
+            continue
+        curve = tuple(_configuration_at(experiment, configuration, kind, value) for value in values)
+        if curve not in curves.values():
+            curves[name] = curve
+    return curves
+
+
+def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -> bool:
+    units = [experiment.units[name] for name in experiment.units_of(configuration)]
+    if kind == "units":
+        return any(not _is_ego(unit) for unit in units)
+    if kind == "latency_s" and isinstance(configuration.latency_s, dict):
+        return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
+    if kind == "rate_hz":
+        return any(unit.recorded is None for unit in units)
+    return kind != "share" or any(isinstance(unit.on, Carriers) for unit in units)
+
+
+def _is_ego(unit: Unit) -> bool:
+    return unit.on == "ego"
+
+
+def _configuration_at(
+    experiment: Experiment, configuration: Configuration, kind: str, value: float
+) -> Configuration | None:
+    if kind == "latency_s":
+        by_unit = configuration.latency_s
+        late = by_unit | {"default": value} if isinstance(by_unit, dict) else value
+        return configuration.model_copy(update={"latency_s": late})
+    if kind != "units":
+        return configuration
+    heard = experiment.units_of(configuration)
+    others = [name for name in heard if not _is_ego(experiment.units[name])]
+    kept = [name for name in heard if name not in others[int(value) :]]
+    if value > len(others) or not kept:
+        return None
+    return configuration.model_copy(update={"units": tuple(kept)})
+
+
+def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
+    if kind == "rate_hz":
+        return {
+            name: unit if unit.recorded else unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()
+        }
+    if kind == "share":
+        return {
+            name: unit.model_copy(update={"on": unit.on.model_copy(update={"share": value})})
+            if isinstance(unit.on, Carriers)
+            else unit
+            for name, unit in units.items()
+        }
+    return dict(units)

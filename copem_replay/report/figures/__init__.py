@@ -1,0 +1,28 @@
+"""Plot: figures from a results folder, each by a function that takes the results and gives a matplotlib Figure.
+
+| function | shows |
+|---|---|
+| `runs_figure` | one run in up to four configurations: speed, distance, visible share, and what happened when |
+| `distances_figure` | distance at detection of every row, a strip per configuration, pass and fail told apart |
+| `curves_figure` | share detected over the time since the onset, with 95 % bands |
+| `sweeps_figure` | shares and times over what was swept, where the folder has a `sweep.csv` |
+
+`write_figures` makes the files. Nothing of matplotlib is imported before a figure is asked for, and pyplot never is.
+"""
+
+from copem_replay.report.figures.detection_curves import curves_figure
+from copem_replay.report.figures.distances import distances_figure
+from copem_replay.report.figures.single_runs import runs_figure
+from copem_replay.report.figures.sweeps import sweeps_figure
+from copem_replay.report.figures.write import write_figures
+from copem_replay.results.folder import Results, load_results
+
+__all__ = [
+    "Results",
+    "curves_figure",
+    "distances_figure",
+    "load_results",
+    "runs_figure",
+    "sweeps_figure",
+    "write_figures",
+]

@@ -1,0 +1,75 @@
+"""Bands around curves of detection: 95 % by drawing whole clusters of rows with replacement.
+
+Clusters are what hangs together: the runs of the one measured object; else logs, or objects, where there are at least
+five; with fewer there is no band. Limits are, instant by instant, those of a share in `summary.csv` (metrics/intervals.py):
+every configuration resamples the same clusters. Letters: n rows, K clusters, R resamples, G instants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from copem_replay.core.tracks import Float, Int
+from copem_replay.metrics.intervals import Counts, effective_number, percentile_limits, resamples, widened
+from copem_replay.metrics.survival import CENSORED, DETECTED
+
+RESAMPLES = 400
+"""Of a band (chosen: its limits are then off by about 1 % of what lies between them)."""
+_CELLS = 4_000_000
+"""Resamples × rows held at a time (chosen: 32 MB a column)."""
+
+
+def band(
+    time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int, *, confidence: float = 0.95
+) -> tuple[Float, Float]:
+    """Limits (G,) of the cumulative incidence at instants (G,).
+
+    `time_s (n,)`, `ending (n,)` as in `statistics.cumulative_incidence`; `cluster (n,)`: the name of each row's.
+    """
+    names, of = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
+    resampled = resamples([str(name) for name in names], seed, RESAMPLES)
+    # Rows of one cluster that end alike at one time are one row that counts as often.
+    order = np.lexsort((of, ending, time_s))
+    keys = np.stack([time_s, ending, of])[:, order]
+    first = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
+    alike = np.diff(np.append(first, len(order)))
+    kept = order[first]
+
+    def curves(count: Counts) -> Float:
+        return resampled_incidence(time_s[kept], ending[kept], count[:, of[kept]].astype(np.int64) * alike, at_s)
+
+    size = max(1, _CELLS // max(len(kept), len(at_s)))
+    blocks = [curves(resampled.count[k : k + size]) for k in range(0, len(resampled.count), size)]
+    share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(of))
+    limits = [percentile_limits(at, resampled, confidence=confidence) for at in np.concatenate(blocks).T]
+    of_all = [widened(*one, n, confidence=confidence)[1:] for one in zip(limits, share.tolist(), strict=True)]
+    low, high = np.array(of_all).reshape(-1, 2).T
+    return low, high
+
+
+def resampled_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> Float:
+    """(R, G) the cumulative incidence at instants (G,) of rows (n,), sorted by time, that count `count (R, n)` times.
+
+    The estimator of `statistics.cumulative_incidence`, all resamples at once. NaN where a resample has no row.
+    """
+    until = np.concatenate([np.zeros((len(count), 1)), np.cumsum(count, axis=1)], axis=1)
+    total = until[:, -1:]
+    weight = np.where(ending == DETECTED, count, 0).astype(float)
+    lost_s = np.unique(time_s[ending == CENSORED])
+    if len(lost_s):
+        lost = np.concatenate(
+            [np.zeros((len(count), 1)), np.cumsum(np.where(ending == CENSORED, count, 0), axis=1)], axis=1
+        )
+        before, after = (np.searchsorted(time_s, lost_s, side=side) for side in ("left", "right"))
+        gone, remaining = lost[:, after] - lost[:, before], total - until[:, after]
+        # Who is censored hands his weight on to all who remain; where nobody does, nobody takes it over.
+        factors = np.divide(gone, remaining, out=np.zeros_like(gone), where=remaining > 0) + 1.0
+        handed = np.concatenate([np.ones((len(count), 1)), np.cumprod(factors, axis=1)], axis=1)
+        weight *= handed[:, np.searchsorted(lost_s, time_s, side="left")]
+    summed = np.concatenate([np.zeros((len(count), 1)), np.cumsum(weight, axis=1)], axis=1)
+    with np.errstate(invalid="ignore"):  # a resample without a row: its clusters have none
+        shares = summed[:, np.searchsorted(time_s, at_s, side="right")] / total
+    result: Float = np.minimum(shares, 1.0)
+    return result

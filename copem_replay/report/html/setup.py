@@ -1,0 +1,134 @@
+"""What was compared, in words: the question, and each configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from copem_replay.core.text import counted
+from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.io.window import in_words
+from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, StartsMoving
+from copem_replay.report.html.markup import Html, table, tag
+from copem_replay.report.html.study import Study
+from copem_replay.report.html.tables import named
+
+_CLASSES = {"vru": "vulnerable road user", "vehicles": "vehicle"}
+_NAMED = 6
+"""Units, logs or objects that are named one by one, at most (chosen)."""
+
+
+def some(names: Sequence[str]) -> str:
+    """Names, the first of them where they are many."""
+    shown = ", ".join(names[:_NAMED])
+    return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"
+
+
+def together(names: Sequence[str]) -> str:
+    """`A, B and C`; the first of them where they are many."""
+    return f"{some(names[:-1])} and {names[-1]}" if 1 < len(names) <= _NAMED else some(names)
+
+
+def logs(study: Study) -> str:
+    """Which recordings."""
+    names = [file.name for file in study.results.logs]
+    window = study.results.experiment.window_s
+    part = ""
+    if window is not None and window != (None, None):
+        part = f" ({in_words(*window)} of {'it' if len(names) == 1 else 'each'})"
+    return (f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({some(names)})") + part
+
+
+def question(study: Study) -> str:
+    """What was asked."""
+    experiment = study.results.experiment
+    measure = experiment.measure
+    if measure.objects.ids is not None:
+        whom = f"{'object' if len(measure.objects.ids) == 1 else 'objects'} {some(measure.objects.ids)}"
+    elif measure.objects.classes is not None:
+        whom = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
+    else:
+        whom = "everybody who moves"
+    which = f"each of {len(study.names)} configurations" if len(study.names) > 1 else "the one configuration"
+    far = "" if experiment.measure.distance_to != "ego" or experiment.ego == "none" else ", and how far away,"
+    return (
+        f"On {logs(study)}: how soon{far} would the receiver have known of {whom}, with {which} of perception "
+        "units, latencies and fusion?"
+    )
+
+
+def setting(study: Study) -> str:
+    """How it was measured: rows, and when the clock starts."""
+    results = study.results
+    things = results.table.groupby(["log", "object_id"]).ngroups if len(results.table) else 0
+    rows = len(results.table) // len(study.names)
+    confirm = results.experiment.measure.confirm
+    hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
+    return (
+        f"{counted(things, 'measured object')}, {counted(results.experiment.runs, 'run')}, so {counted(rows, 'row')} "
+        f"for each configuration; all see the same dice (seed {results.experiment.seed}). "
+        f"The clock of an object starts {_onset(results.experiment)}.{hits}"
+    )
+
+
+def _onset(experiment: Experiment) -> str:
+    onset, near = experiment.measure.onset, experiment.measure.distance_to
+    whom = "the ego" if near == "ego" else f"unit {near}"
+    if isinstance(onset, StartsMoving):
+        within = ""
+        if onset.within_m is not None:
+            within = f" within {onset.within_m:g} m of {whom}{'’s front' if onset.from_ == 'front' else ''}"
+        return f"when it moves at {onset.speed_mps:g} m/s or more{within}"
+    if isinstance(onset, InRange):
+        return f"when it comes within {onset.range_m:g} m of {whom}"
+    if isinstance(onset, LineOfSight):
+        by = "a unit of the ego" if onset.kind == "line_of_sight" else "any unit"
+        return f"when {by} sees {100 * onset.visible_share:g} % of it"
+    if isinstance(onset, At):
+        return f"{onset.time_s:g} s after the log’s start"
+    assert isinstance(onset, Appears)
+    return "when it appears in the log"
+
+
+def configurations(study: Study) -> Html:
+    """What each configuration is made of."""
+    experiment = study.results.experiment
+    rows = []
+    for name, configuration in experiment.configurations.items():
+        truth = configuration.units == "truth"
+        units = experiment.units_of(configuration)
+        cells = (
+            "the truth itself" if truth else f"{len(units)}: {some(units)}" if len(units) > 1 else "".join(units),
+            "–" if truth else _fusion(configuration),
+            _latency(configuration, units),
+        )
+        rows.append(
+            tag(
+                "tr",
+                named(study, name),
+                *(
+                    tag("td", cell, class_=kind)
+                    for cell, kind in zip(cells, ("text long", "text", "text long"), strict=True)
+                ),
+            )
+        )
+    head = ["configuration", "units", "fusion", "latency"]
+    return table(head, rows, caption="The configurations, and how each is drawn", id_="configurations")
+
+
+def _fusion(configuration: Configuration) -> str:
+    """Its kind, and what is not by default."""
+    fusion = configuration.fusion
+    said = fusion.model_dump(mode="json", by_alias=True)
+    kind = str(said.pop("kind"))
+    plain = {key: field.get_default() for key, field in type(fusion).model_fields.items()}
+    other = [f"{key}: {value}" for key, value in said.items() if value != plain.get(key)]
+    return f"{kind} ({', '.join(other)})" if other else kind
+
+
+def _latency(configuration: Configuration, units: Sequence[str]) -> str:
+    if not isinstance(configuration.latency_s, dict):
+        return f"{configuration.latency_s:g} s"
+    by: dict[float, list[str]] = {}
+    for unit in units:
+        by.setdefault(configuration.latency_of(unit), []).append(unit)
+    return "; ".join(f"{some(of)} {latency_s:g} s" for latency_s, of in by.items())

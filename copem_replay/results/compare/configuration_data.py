@@ -1,0 +1,204 @@
+"""One side of a pair: what a configuration gave, laid out on the grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.results.compare.labels import Named
+from copem_replay.results.compare.pairing import Grid, flag, lists, number, whole
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+T = TypeVar("T", bound=np.generic)
+_AGAIN = "run the experiment again with --overwrite"
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Lists of a configuration against the truth: of each cell `length` of them from `first` on, at `start` in values.
+
+    `first` counts in the instants of the cell's log; `available_s` has those of all logs, log by log.
+    """
+
+    start: Int  # (N·S,)
+    length: Int  # (N·S,)
+    first: Int  # (N·S,)
+    ghosts: Int  # (N·S,) false entries nearest to this object
+    error_m: Float  # (V,) NaN: not matched
+    gospa: Float  # (V,) this object's part of GOSPA to its power; NaN: before the onset
+    available_s: tuple[Float, ...]  # L times (K,)
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """Entries of a configuration that are at no object, by place; `at`: with those below each existence left out."""
+
+    there: Bool  # (L·S,)
+    minutes: Float  # (L·S,)
+    count: Int  # (L·S,)
+    existence: Float  # (T,) ascending
+    at: Int  # (L·S, T)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """When each cell is detected (C,) if entries below any threshold up to `existence (C,)` are left out."""
+
+    cell: Int
+    existence: Float
+    detection_s: Float
+
+
+@dataclass(frozen=True)
+class Side:
+    """A configuration on the grid: columns by cell, that mean nothing where it is not `there`. None: not written."""
+
+    label: str
+    path: Path
+    there: Bool
+    detected: Bool
+    left: Bool  # never detected, if it was not
+    onset_s: Float
+    ended_s: Float
+    detection_s: Float
+    distance_m: Float
+    conflict: Bool | None
+    passes: Bool | None
+    accuracy: Accuracy | None
+    ghosts: Ghosts | None
+    steps: Steps | None
+
+
+def side_of(one: Named, grid: Grid) -> Side:
+    """Lay a configuration out. Raises InputError where its tables are damaged or don't go together."""
+    import pyarrow.compute as pc
+
+    folder = one.folder
+    mine = {
+        name: table.filter(pc.equal(table["configuration"], one.configuration)) for name, table in folder.tables.items()
+    }
+    rows = mine["detections.parquet"]
+    cell = grid.cells(rows)
+    place = folder.path / "detections.parquet"
+    _check_once(place, cell, one.configuration)
+    detected = flag(rows["detected"])
+    for name, wanted in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
+        if (np.isnan(number(rows[name])) & wanted).any():
+            raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {_AGAIN}")
+    braking = folder.braking is not None
+    size = len(grid.object_of)
+    return Side(
+        label=one.label,
+        path=folder.path,
+        there=_laid(np.ones(len(cell), dtype=bool), cell, size),
+        detected=_laid(detected, cell, size),
+        left=_laid(_is_left(rows), cell, size),
+        onset_s=_laid(number(rows["onset_s"]), cell, size),
+        ended_s=_laid(number(rows["ended_s"]), cell, size),
+        detection_s=_laid(number(rows["detection_s"]), cell, size),
+        distance_m=_laid(number(rows["distance_at_detection_m"]), cell, size),
+        conflict=_laid(flag(rows["conflict"]), cell, size) if braking else None,
+        passes=_laid(flag(rows["braking_pass"]), cell, size) if braking else None,
+        accuracy=_accuracy(folder.path, mine, cell, grid),
+        ghosts=_ghosts(folder.path / "lists.parquet", mine, grid, one.configuration),
+        steps=_steps(mine, grid),
+    )
+
+
+def _laid(values: NDArray[T], cell: Int, size: int) -> NDArray[T]:
+    """(size,) values by cell; where there are none NaN, 0 or False."""
+    out = np.full(size, np.nan if values.dtype.kind == "f" else 0, dtype=values.dtype)
+    out[cell[cell >= 0]] = values[cell >= 0]
+    return out
+
+
+def _is_left(rows: pa.Table) -> Bool:
+    import pyarrow.compute as pc
+
+    return flag(pc.equal(rows["ended_by"], "object_left"))
+
+
+def _check_once(place: Path, cell: Int, configuration: str) -> None:
+    there = cell[cell >= 0]
+    if len(np.unique(there)) != len(there):
+        raise InputError(
+            f"{place}: {configuration}: expected each log, run and object once, found some twice; {_AGAIN}"
+        )
+
+
+def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) -> Accuracy | None:
+    if not {"accuracy.parquet", "instants.parquet"} <= set(tables):
+        return None
+    rows, place = tables["accuracy.parquet"], folder / "accuracy.parquet"
+    if not np.array_equal(grid.cells(rows), cell):
+        raise InputError(f"{place}: expected the rows of detections.parquet, found others; {_AGAIN}")
+    length, error_m = lists(rows["error_m"])
+    parts, gospa = lists(rows["gospa_m2"])
+    if not np.array_equal(length, parts):
+        raise InputError(f"{place}: expected error_m and gospa_m2 of equal length, found others; {_AGAIN}")
+    instants = tables["instants.parquet"]
+    counts, flat_s = lists(instants["available_s"])
+    until, of_log = np.cumsum(counts), grid.log_numbers(instants)
+    times_s = {int(of_log[k]): flat_s[until[k] - counts[k] : until[k]] for k in range(len(counts))}
+    available_s = tuple(times_s.get(k, np.empty(0)) for k in range(len(grid.logs)))
+    first, size = whole(rows["first_list"]), len(grid.object_of)
+    kept = cell >= 0
+    last = np.array([len(times) for times in available_s], dtype=np.int64)[grid.log_of[cell[kept]]]
+    if (first[kept] < 0).any() or ((first + length)[kept] > last)[length[kept] > 0].any():
+        raise InputError(f"{place}: expected lists of instants.parquet, found more; {_AGAIN}")
+    start = np.cumsum(length) - length
+    return Accuracy(
+        start=_laid(start, cell, size),
+        length=_laid(length, cell, size),
+        first=_laid(first, cell, size),
+        ghosts=_laid(whole(rows["ghosts"]), cell, size),
+        error_m=error_m,
+        gospa=gospa,
+        available_s=available_s,
+    )
+
+
+def _ghosts(place: Path, tables: dict[str, pa.Table], grid: Grid, configuration: str) -> Ghosts | None:
+    if "lists.parquet" not in tables:
+        return None
+    rows = tables["lists.parquet"]
+    at_place, size = grid.places(rows), len(grid.logs) * grid.runs
+    _check_once(place, at_place, configuration)
+    steps, existence = lists(rows["existence"])
+    counts, ghosts_at = lists(rows["ghosts_at"])
+    count = int(steps[0]) if len(steps) else 0
+    alike = (steps == count).all() and (counts == count).all()
+    if (
+        not alike
+        or (existence.reshape(len(steps), count) != existence[:count]).any()
+        or (np.diff(existence[:count]) <= 0).any()
+    ):
+        raise InputError(
+            f"{place}: expected the same ascending existence and as many ghosts_at in all rows, found others; {_AGAIN}"
+        )
+    at = np.zeros((size, count), dtype=np.int64)
+    at[at_place[at_place >= 0]] = ghosts_at.reshape(len(steps), count)[at_place >= 0]
+    return Ghosts(
+        there=_laid(np.ones(len(at_place), dtype=bool), at_place, size),
+        minutes=_laid(number(rows["minutes"]), at_place, size),
+        count=_laid(whole(rows["ghosts"]), at_place, size),
+        existence=existence[:count],
+        at=at,
+    )
+
+
+def _steps(tables: dict[str, pa.Table], grid: Grid) -> Steps | None:
+    if "thresholds.parquet" not in tables:
+        return None
+    rows = tables["thresholds.parquet"]
+    cell = grid.cells(rows)
+    kept = cell >= 0
+    return Steps(cell[kept], number(rows["existence"])[kept], number(rows["detection_s"])[kept])

@@ -1,0 +1,55 @@
+"""Limits of a difference: over resamples, exact, or none and why."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from copem_replay.metrics.fixed import NOTHING_DRAWN
+from copem_replay.metrics.intervals import alike_limits, effective_number, percentile_limits
+from copem_replay.results.compare.bootstrap import Clusters, Draws, Whose, clusters, resampled_over
+from copem_replay.results.compare.differences import Figure
+from copem_replay.results.compare.pairing import Grid
+
+ALL_ALIKE = "all clusters alike"
+"""Why there is no interval: the difference is the same in every cluster, and how it varies is not known."""
+_SAME = 1e-9
+"""Differences this close are the same (chosen: below what any of the metrics is measured with)."""
+
+
+def limits(
+    figure: Figure, difference: float, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool
+) -> dict[str, object]:
+    """The columns `low`, `high`, `interval` and `interval_over` of a difference, as far as there are any.
+
+    `pair`: all rows that both sides have. `fixed`: the figure is the same in every run, on either side.
+    """
+    over = resampled_over(pair)
+    if not math.isfinite(difference):
+        return {}
+    if over == "runs" and fixed:
+        return {"interval": NOTHING_DRAWN}
+    drawn = clusters(figure.whose, over, grid)
+    if drawn is None or not (figure.by_object or over != "objects"):
+        return {}
+    resampled = draws.of(drawn.names)
+    low, high = percentile_limits(figure.resampled(drawn, resampled.count), resampled)
+    kind = "bootstrap"
+    if abs(high - low) <= _SAME and _alike(figure, drawn):
+        if figure.only is None:
+            return {"interval": ALL_ALIKE}
+        rows = np.bincount(drawn.of[drawn.of >= 0], figure.n[drawn.of >= 0], minlength=len(drawn.names))
+        kind, (low, high) = "exact", alike_limits(difference, effective_number(rows))
+    found = {"low": low, "high": high}
+    return {name: limit if math.isfinite(limit) else None for name, limit in found.items()} | {
+        "interval": kind,
+        "interval_over": over,
+    }
+
+
+def _alike(figure: Figure, drawn: Clusters) -> bool:
+    """Whether each cluster by itself has the same difference; those without any are left out."""
+    alone = figure.resampled(drawn, np.eye(len(drawn.names), dtype=np.uint32))
+    known = alone[~np.isnan(alone)]
+    return bool(len(known) and np.isfinite(known).all() and np.ptp(known) <= _SAME)

@@ -1,0 +1,107 @@
+"""What has to be said of a comparison: what was left out, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import pandas as pd
+
+from copem_replay.core.text import counted
+from copem_replay.core.tracks import Bool
+from copem_replay.metrics.summary import FEWEST_CLUSTERS
+from copem_replay.results.compare.configuration_data import Side
+from copem_replay.results.compare.labels import Named
+from copem_replay.results.compare.per_list import shared_instants
+from copem_replay.results.folders import OPTIONAL, Folder
+
+_NEEDED = {
+    "position_rmse_m": {"accuracy.parquet", "instants.parquet"},
+    "gospa_m": {"accuracy.parquet", "instants.parquet"},
+    "ghosts_per_min": {"lists.parquet"},
+    "ttd_rmst_s_equal_ghosts": {"lists.parquet", "thresholds.parquet"},
+}
+
+
+def notes_on_folders(folders: Sequence[Folder]) -> Iterator[str]:
+    """What folders do not have, or have more of than others."""
+    runs = {str(folder.path): folder.runs for folder in folders}
+    if len(set(runs.values())) > 1:
+        has = ", ".join(f"{path} {count}" for path, count in runs.items())
+        yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
+    for folder in folders:
+        missing = [name for name in OPTIONAL if name not in folder.tables]
+        metrics = [metric for metric, files in _NEEDED.items() if files & set(missing)]
+        if metrics:
+            yield (
+                f"{folder.path}: no {', '.join(missing)} (without accuracy, with units that only some runs have, or of "
+                f"an older version): not compared: "
+                f"{', '.join(metrics)}"
+            )
+    with_braking = [folder for folder in folders if folder.braking is not None]
+    if with_braking and len(with_braking) < len(folders):
+        without = ", ".join(str(folder.path) for folder in folders if folder.braking is None)
+        yield f"{without}: no braking: pass_share is compared only among those that have it"
+
+
+def notes_on_pairs(baseline: str, baseline_there: Bool, there: Mapping[str, Bool]) -> Iterator[str]:
+    """Rows without a partner."""
+    for label, mine in there.items():
+        for whose, count in ((label, (mine & ~baseline_there).sum()), (baseline, (baseline_there & ~mine).sum())):
+            if count:
+                other = baseline if whose is label else label
+                yield f"{counted(int(count), 'row')} of {whose} left out: {other} has no such object"
+
+
+def notes_on_instants(baseline: Side, others: Sequence[Side], logs: Sequence[str]) -> Iterator[str]:
+    """Lists that have no list of the other configuration at the same instant."""
+    alike: dict[tuple[int, int, int, str], list[str]] = {}
+    for side in others:
+        if side.accuracy is None or baseline.accuracy is None:
+            continue
+        shared = shared_instants(side.accuracy, baseline.accuracy)
+        mine, theirs = (sum(map(len, one.accuracy.available_s)) for one in (side, baseline) if one.accuracy)
+        if shared.sum() < max(mine, theirs):
+            none = ", ".join(name for name, number in zip(logs, shared, strict=True) if number == 0)
+            alike.setdefault((int(shared.sum()), mine, theirs, none if len(logs) > 1 else ""), []).append(side.label)
+    for (number, mine, theirs, none), labels in alike.items():
+        lacking = f"; none in {none}" if none else ""
+        yield (
+            f"{', '.join(labels)}: position_rmse_m and gospa_m are over the {counted(number, 'instant')} that both "
+            f"have, of {mine} and the {theirs} of {baseline.label}{lacking}"
+        )
+
+
+def note_on_measuring(baseline: Named, others: Sequence[Named]) -> Iterator[str]:
+    """Who detects by truth id where the others have to be matched."""
+    by_id = [one for one in (baseline, *others) if one.configuration in one.folder.by_truth_id]
+    if by_id and len(by_id) <= len(others):
+        yield (
+            f"{', '.join(one.label for one in by_id)}: detected by truth id, the others by match within the gate "
+            "(`match: {always: true}` matches all alike)"
+        )
+
+
+def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
+    """Intervals that there are not, and ghosts fewer than `asked` per minute."""
+    overall = table.drop_duplicates(["configuration", "metric"])
+    without = overall[overall["difference"].notna() & overall["interval"].isna()]
+    with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
+    nameless = (without["metric"] == "ghosts_per_min") & without["configuration"].isin(with_interval)
+    if nameless.any():
+        yield (
+            "no interval of ghosts_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+        )
+    without = without[~nameless]
+    if len(without):
+        metrics = ", ".join(dict.fromkeys(without["metric"]))
+        yield (
+            f"no interval of {metrics}: neither {FEWEST_CLUSTERS} logs, nor {FEWEST_CLUSTERS} measured objects, nor "
+            f"{FEWEST_CLUSTERS} runs of a single one; more runs of several do not tell about other traffic"
+        )
+    ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
+    fewer = ghosts[ghosts["ghosts_kept_per_min"] < asked * (1 - 1e-9)] if asked is not None else ghosts[:0]
+    for row in fewer.itertuples():
+        yield (
+            f"{row.configuration}: all its entries make {row.ghosts_kept_per_min:.4g} ghosts per minute only: its "
+            "ttd_rmst_s_equal_ghosts is at that"
+        )

@@ -1,0 +1,49 @@
+"""The log again: figures of single runs need the world itself, which a results folder names but does not hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import read_logs
+from copem_replay.io.checksum import sha256_of
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.config import Objects
+from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.results.folder import Results
+
+
+def reread(results: Results, log: str, object_id: str) -> Replay:
+    """One log made ready once more, looked at for one object only.
+
+    Raises RecordingError, one line, where the recording is missing or not the one that was replayed, or has no ego.
+    """
+    measure = results.experiment.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
+    experiment = results.experiment.model_copy(update={"measure": measure})
+    recording = read_again(results, log, experiment)
+    if recording.scene.ego_ix < 0:
+        raise RecordingError(f"{recording.path}: no ego in this study, whose runs could be drawn")
+    return prepare(recording, experiment)
+
+
+def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
+    """A log of the results as an experiment, theirs or one made of it, reads it.
+
+    Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
+    """
+    file = next(file for file in results.logs if file.name == log)
+    try:
+        found = sha256_of(file.path)
+    except RecordingError as error:
+        raise RecordingError(f"{error}; put the log back to draw its runs") from None
+    if found != file.sha256:
+        raise RecordingError(
+            f"{file.path}: expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {found[:12]}…; "
+            "put that log back, or run the experiment again"
+        )
+    recordings, refused = read_logs(experiment, [file.path], results.source)
+    if refused:
+        raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
+    # Draws are addressed by the log's name, which depends on what else was replayed.
+    return replace(recordings[0], scene=replace(recordings[0].scene, log=log))

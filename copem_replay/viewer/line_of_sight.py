@@ -1,0 +1,161 @@
+"""How the shown objects look from every modelled unit: in its field of view or not, and what hides them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
+from copem_replay.core.tracks import Bool, Float, Int, Tracks
+from copem_replay.core.view_geometry import Look
+from copem_replay.experiment.schema import Experiment, Unit
+from copem_replay.perception.pem.condition import Condition, Couple
+from copem_replay.perception.sensor_poses import Poses, carrier, observers, poses, unit_ground
+from copem_replay.perception.visibility import hidden_by, visible_shares
+from copem_replay.pipeline.chunking import ROWS_A_STRETCH
+from copem_replay.pipeline.log_replay import Replay
+from copem_replay.viewer.sink import f32
+
+CLEAR_ABOVE = 0.5
+"""Seen when more than this share of it is (chosen)."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """At frames of the truth (K,), of objects (M,), from the experiment's units (U,), those that are modelled.
+
+    `share`: NaN outside the unit's field of view, where it is absent, or carried by the object. `body_ix`: of what is
+    not clearly seen the object that hides most of it, −1 − k: the obstacle k; `body_m` where that is.
+    """
+
+    elapsed_ns: Int
+    object_ix: Int
+    share: Float  # (U, K, M)
+    in_range: Bool  # (U, K, M)
+    body_ix: Int  # (U, K, M)
+    body_m: Float  # (U, K, M, 3)
+    place_m: Float  # (U, K, 3) of the unit
+
+
+def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight:
+    """Computed only at the frames at which one of the shown objects is there."""
+    scene, truth = replay.scene, replay.truth
+    stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
+    shape = (len(experiment.units), len(stamps), len(shown))
+    seen = Sight(
+        elapsed_ns=stamps - scene.t0_ns,
+        object_ix=np.array(shown, dtype=np.int64),
+        share=np.full(shape, np.nan),
+        in_range=np.zeros(shape, dtype=bool),
+        body_ix=np.zeros(shape, dtype=np.int64),
+        body_m=np.full((*shape, 3), np.nan),
+        place_m=np.full((*shape[:2], 3), np.nan),
+    )
+    obstacles = _obstacle_centres(replay, experiment)
+    # So many frames at once as have the rows of a stretch: what hides an object is searched among all that is there.
+    at_once = max(1, ROWS_A_STRETCH * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
+    for first in range(0, len(stamps), at_once):
+        _look_at(replay, experiment, seen, slice(first, first + at_once), obstacles)
+    return seen
+
+
+def _look_at(replay: Replay, experiment: Experiment, seen: Sight, part: slice, obstacles: np.ndarray) -> None:
+    """From all units at some of the frames. Out: their part of `seen`."""
+    scene, truth, shown = replay.scene, replay.truth, seen.object_ix.tolist()
+    world = _world(replay, experiment, seen.elapsed_ns[part])
+    rows, column = _rows(world, shown)
+    if not len(rows):
+        return
+    frame = part.start + world.frame_ix[rows]
+    for u, (name, unit) in enumerate(experiment.units.items()):
+        if unit.recorded is not None:
+            continue
+        at = poses(scene, unit, world, unit_ground(truth, name, unit, []))
+        watching = observers([at], np.array([carrier(scene, unit)]))
+        [share] = visible_shares(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
+        look = _look(at, world, rows, scene.object_class[world.row_object_ix[rows]])
+        pem = experiment.pems[str(unit.pem)]
+        in_field = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
+        seen.place_m[u, part] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
+        seen.in_range[u, frame, column] = _anywhere(pem, look, "range_m")
+        seen.share[u, frame, column] = np.where(in_field, share[rows], np.nan)
+        _hidden(replay, experiment, unit, at, seen, u, part, obstacles)
+
+
+def _world(replay: Replay, experiment: Experiment, elapsed_ns: Int) -> Tracks:
+    """The truth at frames (K,), ascending."""
+    t0_ns, gap_s = replay.scene.t0_ns, experiment.max_gap_s
+    around_s = gap_s + AROUND_S
+    near = replay.truth.captured_between(elapsed_ns[0] * 1e-9 - around_s, elapsed_ns[-1] * 1e-9 + around_s)
+    return at_instants(near, t0_ns + elapsed_ns, t0_ns=t0_ns, max_gap_s=gap_s)
+
+
+def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
+    """The rows of the shown objects, and which of them each is about."""
+    rows = np.flatnonzero(np.isin(world.row_object_ix, shown))
+    return rows, np.argsort(shown)[np.searchsorted(np.sort(shown), world.row_object_ix[rows])]
+
+
+def _hidden(
+    replay: Replay, experiment: Experiment, unit: Unit, at: Poses, seen: Sight, u: int, part: slice,
+    obstacles: np.ndarray,
+) -> None:  # fmt: skip
+    """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`.
+
+    `at`: where the unit is at the frames of the `part`.
+    """
+    within = np.flatnonzero((seen.share[u, part] <= CLEAR_ABOVE).any(axis=1))
+    if not len(within):
+        return
+    frames = part.start + within
+    world = _world(replay, experiment, seen.elapsed_ns[frames])
+    then = Poses(*(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
+    watching = observers([then], np.array([carrier(replay.scene, unit)]))
+    [hides] = hidden_by(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
+    rows, column = _rows(world, seen.object_ix.tolist())
+    kept = hides[rows] != -1  # nothing hides any of it
+    rows, column = rows[kept], column[kept]
+    count = len(world.frame_ix)
+    body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
+    whose = np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))])
+    where = np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), obstacles])
+    seen.body_ix[u, frames[world.frame_ix[rows]], column] = whose[body]
+    seen.body_m[u, frames[world.frame_ix[rows]], column] = where[body]
+
+
+def _look(at: Poses, world: Tracks, rows: Int, class_ix: np.ndarray) -> Look:
+    """What fields of view ask: range, azimuth and class; of the rest nothing is said."""
+    frames = world.frame_ix[rows]
+    dx, dy = world.x_m[0, rows] - at.x_m[frames], world.y_m[0, rows] - at.y_m[frames]
+    bearing = np.arctan2(dy, dx)
+    nothing = np.full(len(dx), np.nan)
+    rest = dict.fromkeys(Look.__dataclass_fields__, nothing)
+    known = {
+        "range_m": np.hypot(dx, dy),
+        "azimuth_rad": wrap(bearing - at.heading_rad[frames]),
+        "bearing_rad": bearing,
+        "class_ix": class_ix,
+    }
+    return Look(**(rest | known))
+
+
+def _anywhere(pem: tuple[Couple, ...], look: Look, *keys: str) -> Bool:
+    """(P,) where these parts of the condition of some couple hold."""
+    conditions = [Condition(**{key: getattr(couple.when, key) for key in keys}) for couple in pem]
+    with np.errstate(invalid="ignore"):
+        held: Bool = np.any([condition.holds(look) for condition in conditions], axis=0)
+    return held & ~np.isnan(look.range_m)
+
+
+def _obstacle_centres(replay: Replay, experiment: Experiment) -> np.ndarray:
+    """(K, 3) of the experiment's own obstacles, halfway up."""
+    import shapely
+
+    static = replay.placed.static
+    if not experiment.obstacles:
+        return np.empty((0, 3), dtype=np.float32)
+    middle = shapely.centroid([shapely.Polygon(o.polygon_m) for o in experiment.obstacles])
+    _, part = np.unique(static.body, return_index=True)
+    return f32(shapely.get_x(middle), shapely.get_y(middle), (static.bottom_m + static.top_m)[part] / 2)

@@ -1,0 +1,63 @@
+"""Merge: experiments that are compared, as one that holds the configurations of all, for what shows them together.
+
+Nothing is drawn with it: draws are by the units' names, and units of one name that differ get another here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.perception.pem.condition import Pem
+
+
+@dataclass(frozen=True)
+class Part:
+    """An experiment, what its folder is called, and what its configurations are called in the merged one."""
+
+    name: str
+    experiment: Experiment
+    labels: Mapping[str, str]
+
+
+def merged(parts: Sequence[Part]) -> Experiment:
+    """The first experiment with the units and configurations of all."""
+    units: dict[str, Unit] = {}
+    pems: dict[str, Pem] = {}
+    configurations: dict[str, Configuration] = {}
+    for part in parts:
+        called: dict[str, str] = {}
+        for name, unit in part.experiment.units.items():
+            pem = None if unit.pem is None else part.experiment.pems[unit.pem]
+            called[name] = _called(name, part.name, unit, pem, units, pems)
+            units[called[name]] = unit if pem is None else unit.model_copy(update={"pem": called[name]})
+            if pem is not None:
+                pems[called[name]] = pem
+        for name, label in part.labels.items():
+            configurations[label] = _with(part.experiment, part.experiment.configurations[name], called)
+    changed = {"units": units, "pems": pems, "configurations": configurations, "sweep": None}
+    return parts[0].experiment.model_copy(update=changed)
+
+
+def _called(
+    name: str, folder: str, unit: Unit, pem: Pem | None, units: Mapping[str, Unit], pems: Mapping[str, Pem]
+) -> str:
+    """The unit's own name, where it is free or borne by the same unit; else with the folder's, until it is."""
+    wanted = name
+    while wanted in units:
+        same = units[wanted].model_copy(update={"pem": None}) == unit.model_copy(update={"pem": None})
+        if same and pems.get(wanted) == pem:
+            break
+        wanted = f"{folder}:{wanted}"
+    return wanted
+
+
+def _with(experiment: Experiment, configuration: Configuration, called: Mapping[str, str]) -> Configuration:
+    """A configuration that names its units as they are called in the merged experiment."""
+    changed: dict[str, object] = {}
+    if configuration.units != "truth":
+        changed["units"] = tuple(called[name] for name in experiment.units_of(configuration))
+    if isinstance(configuration.latency_s, dict):
+        changed["latency_s"] = {called.get(unit, unit): late for unit, late in configuration.latency_s.items()}
+    return configuration.model_copy(update=changed)

@@ -1,0 +1,131 @@
+"""The experiment's units: where they are, and the fields of view of their PEMs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from copem_replay.core.colours import Rgb
+from copem_replay.core.interpolation import states_at
+from copem_replay.core.tracks import Float, Tracks
+from copem_replay.experiment.schema import Experiment, Unit
+from copem_replay.perception.pem.condition import Condition, Couple
+from copem_replay.perception.sensor_poses import Poses, carrier, list_instants, mounting_height, unit_ground
+from copem_replay.pipeline.log_replay import Replay
+from copem_replay.viewer.boxes import EGO
+from copem_replay.viewer.sink import Out, f32, upright
+
+MANY_UNITS = 8
+"""With more than these the fixed ones are not named (chosen: twenty names cover the scene)."""
+FIELD: Rgb = (72, 72, 60)
+
+_ARC_STEP_RAD = np.deg2rad(3)  # chosen: a chord of 80 m is 3 cm off the arc
+_ABOVE_GROUND_M = 0.05
+
+
+def units(out: Out, replay: Replay, experiment: Experiment) -> None:
+    """A point and a field of view for each unit; neither while its carrier is absent."""
+    import rerun as rr
+
+    many = len(experiment.units) > MANY_UNITS
+    for name, unit in experiment.units.items():
+        path = ["world", "units", name]
+        mark, named = rr.Radius.ui_points(3), not (many and unit.at is not None)
+        style = rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=named)
+        if unit.recorded is not None:
+            stamps = replay.truth.stamp_ns if unit.on is not None else replay.truth.stamp_ns[:1]
+            place = _recorded_place(replay, experiment, unit, (stamps - replay.scene.t0_ns) * np.float64(1e-9))
+            there = ~np.isnan(place[:, 0])
+            if there.any():
+                columns = rr.Points3D.columns(positions=f32(*place[there].T)).partition(there.astype(np.int64))
+                out.columns(path, stamps - replay.scene.t0_ns, columns)
+                out.static(path, style)
+            continue
+        at = replay.placed.poses[name]
+        place, there = f32(at.x_m, at.y_m, at.z_m), at.present
+        elapsed_ns = list_instants(replay.scene, replay.truth, unit) - replay.scene.t0_ns
+        if unit.at is not None:
+            out.static(path, rr.Points3D.from_fields(positions=place[:1]))
+        else:
+            out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
+        out.static(path, style)
+        height_m = mounting_height(replay.scene, replay.truth, unit)
+        _field(out, name, unit, at, elapsed_ns, experiment.pems[str(unit.pem)], height_m)
+
+
+def unit_places(replay: Replay, experiment: Experiment, heard: Tracks) -> Float:
+    """(F, 3) where the unit of each list was at capture; NaN where that is not known, as of the truth."""
+    place = np.full((len(heard.stamp_ns), 3), np.nan)
+    for k, name in enumerate(heard.units):
+        mine = np.flatnonzero(heard.frame_unit_ix == k)
+        if name not in experiment.units or not len(mine):
+            continue
+        unit = experiment.units[name]
+        if unit.recorded is not None:
+            place[mine] = _recorded_place(replay, experiment, unit, heard.captured_s[mine])
+            continue
+        at = replay.placed.poses[name]
+        row = np.searchsorted(list_instants(replay.scene, replay.truth, unit), heard.stamp_ns[mine])
+        place[mine] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)[row]
+    return place
+
+
+def _recorded_place(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
+    """(K, 3) where a unit is whose lists are recorded: on its carrier, or at its place, if it is given."""
+    place = np.full((len(time_s), 3), np.nan)
+    if unit.at is not None:
+        ground_m = unit_ground(replay.truth, "", unit, [])
+        place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))
+    elif unit.on is not None:
+        on = np.full(len(time_s), carrier(replay.scene, unit))
+        at, there = states_at(
+            replay.truth, on, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
+        )  # fmt: skip
+        high_m = at["height_m"] / 2 if unit.height_m is None else unit.height_m - at["height_m"] / 2
+        place[there] = np.stack([at["x_m"], at["y_m"], at["z_m"] + high_m], axis=-1)[there]
+    return place
+
+
+def outlines(pem: tuple[Couple, ...]) -> list[np.ndarray]:
+    """Borders (K, 2) of where the couples of a PEM apply, ahead along x; none for a couple that ends nowhere."""
+    fields = dict.fromkeys((c.when.range_m, c.when.azimuth_deg) for c in pem)
+    return [border for field in fields for border in _outline(Condition(range_m=field[0], azimuth_deg=field[1]))]
+
+
+def _outline(when: Condition) -> list[np.ndarray]:
+    if when.range_m is None:
+        return []
+    near_m, far_m = when.range_m
+    first, last = np.deg2rad(when.azimuth_deg or (-180.0, 180.0))
+    all_around = last - first >= 2 * np.pi - 1e-9
+    span = 2 * np.pi if all_around else np.mod(last - first, 2 * np.pi)
+    angle = first + np.linspace(0, span, int(np.ceil(span / _ARC_STEP_RAD - 1e-9)) + 1)
+    arc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if all_around:
+        return [radius_m * arc for radius_m in (near_m, far_m) if radius_m > 0]
+    inner = near_m * (arc[::-1] if near_m > 0 else arc[:1])
+    return [np.concatenate([inner[-1:], far_m * arc, inner])]
+
+
+def _field(
+    out: Out, name: str, unit: Unit, at: Poses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...], height_m: float
+) -> None:
+    """The outlines in the unit's own frame, which moves; on the ground under it."""
+    import rerun as rr
+
+    down_m = _ABOVE_GROUND_M - height_m
+    strips = [f32(*line.T, np.full(len(line), down_m)) for line in outlines(pem)]
+    if not strips or not at.present.any():
+        return
+    path, there = ["world", "fields", name], np.flatnonzero(at.present)
+    place, turn = f32(at.x_m[there], at.y_m[there], at.z_m[there]), upright(at.heading_rad[there])
+    if unit.at is not None:
+        out.static(path, rr.Transform3D.from_fields(translation=place[0], quaternion=turn[0]))
+        out.static(path, rr.LineStrips3D.from_fields(strips=strips))
+    else:
+        out.columns(path, elapsed_ns[there], rr.Transform3D.columns(translation=place, quaternion=turn))
+        # Without a transform it would be drawn at the origin: the outlines come and go with the carrier.
+        changes = np.flatnonzero(np.diff(at.present, prepend=False))
+        comes = at.present[changes]
+        lines = rr.LineStrips3D.columns(strips=strips * int(comes.sum())).partition(len(strips) * comes)
+        out.columns(path, elapsed_ns[changes], lines)
+    out.static(path, rr.LineStrips3D.from_fields(colors=[FIELD], radii=rr.Radius.ui_points(0.75)))

@@ -1,0 +1,174 @@
+"""In words: what happened when, and the summary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.tracks import Scene
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.log_replay import Replay
+from copem_replay.viewer.sink import Out, ns, part_of, short_ids
+
+_ENDINGS = {
+    "object_left": "left undetected",
+    "ego_left": "undetected when the ego left",
+    "log_end": "undetected when the log ended",
+}
+
+
+def onsets(out: Out, scene: Scene, table: pd.DataFrame) -> None:
+    """When the clock of each object began: the same for all configurations, and said once."""
+    import rerun as rr
+
+    looks = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
+    text = [
+        f"onset of {_who(look, scene)}" + (", already at its first frame" if look.onset_at_start else "")
+        for look in looks.itertuples()
+    ]
+    out.columns(["events", "onsets"], ns(looks["onset_s"]), rr.TextLog.columns(text=text, level=["INFO"] * len(text)))
+
+
+def events(out: Out, scene: Scene, name: str, part: pd.DataFrame) -> None:
+    """How each look ended. `part`: the rows of one configuration."""
+    import rerun as rr
+
+    told = sorted((_ending(look, scene) for look in part.itertuples()), key=lambda event: event[0])
+    text = [f"{name}: {sentence}" for _, _, sentence in told]
+    columns = rr.TextLog.columns(text=text, level=[level for _, level, _ in told])
+    out.columns(["events", part_of(name)], ns([time_s for time_s, _, _ in told]), columns)
+
+
+def _who(look: Any, scene: Scene) -> str:
+    return f"{short_ids(scene)[scene.object_number[look.object_id]]} {look.object_class}"
+
+
+def _ending(look: Any, scene: Scene) -> tuple[float, str, str]:
+    """When, how serious, what: of one row of the detections."""
+    who, verdict = _who(look, scene), verdict_of(look)
+    then = f"; the ego {verdict}" if verdict else ""
+    if not look.detected:
+        return look.ended_s, "WARN", f"{who} {_ENDINGS[look.ended_by]}{then}"
+    late_s, far_m = look.time_to_detection_s, look.distance_at_detection_m
+    when = f"{abs(late_s):.2f} s {'before' if late_s < 0 else 'after'} the onset"
+    where = "" if np.isnan(far_m) else f", at {far_m:.1f} m"
+    passed = verdict is None or look.braking_pass
+    return look.detection_s, "INFO" if passed else "WARN", f"{who} detected by {look.first_unit} {when}{where}{then}"
+
+
+def verdict_of(look: Any) -> str | None:
+    """What becomes of a row of the detections that is in conflict: “stops” is to stay clear by braking; else None."""
+    if not getattr(look, "conflict", False):
+        return None
+    return "stays clear" if look.braking_pass else "does not stay clear"
+
+
+def differences(out: Out, replay: Replay, table: pd.DataFrame, shown: Sequence[int], left_out: Sequence[str]) -> None:
+    """What difference it made in this run: of several objects one table of all first, then one of each."""
+    import rerun as rr
+
+    of_each = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
+    tables = [_difference(looks, replay.scene) for looks in of_each]
+    if len(shown) > 1:
+        tables.insert(0, _overview(of_each, replay.scene))
+    text = "\n\n".join([*tables, *_left_out(left_out)])
+    out.static(["difference"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _difference(looks: pd.DataFrame, scene: Scene) -> str:
+    first = next(looks.itertuples())
+    braking = bool(getattr(first, "conflict", False))
+    head = ["configuration", "known after", "at distance", *(["verdict", "smallest distance"] if braking else []), "by"]
+    lines = [f"| {' | '.join(head)} |", "| --- |" + " ---: |" * (len(head) - 1)]
+    for look in looks.itertuples():
+        cells = [
+            f"{look.time_to_detection_s:.2f} s" if look.detected else "never",
+            _metres(look.distance_at_detection_m),
+        ]
+        if braking:
+            verdict = "pass" if look.braking_pass else "**fail**"
+            if not look.braking_pass and look.impact_speed_mps > 0:
+                verdict += f" at {look.impact_speed_mps:.1f} m/s"
+            cells += [verdict, _metres(look.min_distance_m)]
+        lines.append(
+            f"| {_cell(look.configuration)} | {' | '.join(cells)} | {look.first_unit if look.detected else '–'} |"
+        )
+    return f"**{_who(first, scene)}**, onset at {first.onset_s:.2f} s\n\n" + "\n".join(lines)
+
+
+def _overview(of_each: Sequence[pd.DataFrame], scene: Scene) -> str:
+    """A row per object, a column per configuration: known after, at a distance, and the verdict."""
+    names = list(of_each[0]["configuration"])
+    lines = [f"| known after | {' | '.join(map(_cell, names))} |", "| --- |" + " ---: |" * len(names)]
+    for looks in of_each:
+        cells = []
+        for look in looks.itertuples():
+            after = f"{look.time_to_detection_s:.2f} s, {_metres(look.distance_at_detection_m)}"
+            verdict = {None: "", "stays clear": ", pass"}.get(verdict_of(look), ", **fail**")
+            cells.append((after if look.detected else "never") + verdict)
+        lines.append(f"| {_who(next(looks.itertuples()), scene)} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def legend(out: Out) -> None:
+    """What colours and lines mean."""
+    import rerun as rr
+
+    out.static(["legend"], rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN))
+
+
+def _cell(text: object) -> str:
+    return str(text).replace("|", "\\|")
+
+
+def _metres(value: Any) -> str:
+    return "–" if value is None or pd.isna(value) else f"{value:.1f} m"
+
+
+def _left_out(names: Sequence[str]) -> list[str]:
+    if not names:
+        return []
+    return [f"Not in this file: {', '.join(names)}. `show: {{configurations: […]}}` chooses others."]
+
+
+LEGEND = """A configuration has one colour everywhere.
+
+- outlines: what was there (white vehicles, pink pedestrians and two-wheelers, darker where stationary), and the ways of
+  those we look at; grey bodies: obstacles
+- filled: what is believed, where it is believed to be, paler the older it is (0 to 1 s); ellipses: 2σ of the position
+- white points: units, with the outlines of their fields of view; thin lines: from each, where it was at capture, to
+  where it listed somebody
+- red lines: from the unit that sees most of somebody to what hides them
+- strong lines on the ground: distance when somebody was first known
+- lanes: dark grey out of view, red hidden, grey seen but not listed, bluish grey listed and not arrived; colour known,
+  at half its strength in the newest list and not known yet: captured before the onset, not confirmed, or too late;
+  pink, a lane for all: since the onset"""
+
+
+def summary(
+    out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, run: int, left_out: Sequence[str]
+) -> None:
+    """Which run this is, and the table over all runs and logs, configurations side by side."""
+    import rerun as rr
+
+    what = f"Run {run} of {replay.scene.log}, seed {experiment.seed}, visibility `{experiment.visibility}`"
+    text = f"{what}. The table is over all runs and logs.\n\n{_markdown(table)}"
+    text = "\n\n".join([text, *_left_out(left_out)])
+    out.static(["summary"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _markdown(frame: pd.DataFrame) -> str:
+    """A table with a column per row of `frame`: configurations side by side."""
+
+    def cell(value: object) -> str:
+        if value is None or value is pd.NA or (isinstance(value, float) and np.isnan(value)):
+            return "–"
+        text = f"{value:.4g}" if isinstance(value, float) else str(value)
+        return _cell(text)
+
+    lines = [[name, *(cell(value) for value in frame[name])] for name in frame.columns]
+    lines.insert(1, ["---"] + ["---:"] * len(frame))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
