@@ -32,9 +32,9 @@ from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.pipeline.log_replay import blocks, prepare
 from copem_replay.pipeline.receiver import World, _without_truth, listen, seen_by_all
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import gnn_oracle
+from tests.oracles import gnn as gnn_oracle
 
 Best = Callable[[Callable[[], object], int], float]
 """Seconds of the fastest of several calls."""

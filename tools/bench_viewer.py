@@ -9,8 +9,8 @@ from pathlib import Path
 
 def first_picture(rrd: Path) -> dict[str, object]:
     """Seconds from a viewer that runs to the first picture of all its views; None: nothing to draw with."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-    from viewer import headless_viewer, vulkan_missing
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from tests.helpers.viewer import headless_viewer, vulkan_missing
 
     if (reason := vulkan_missing()) is not None:
         return {"rrd_first_picture_s": None, "skipped": reason}

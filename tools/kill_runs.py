@@ -211,7 +211,7 @@ def kill(
 
 def main() -> None:
     sys.path.insert(0, str(ROOT / "tests"))
-    from experiments import changed, drive
+    from tests.helpers.experiments import changed, drive
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=300)

@@ -1,0 +1,1 @@
+"""Tests, by wing of the package."""

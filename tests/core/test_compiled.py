@@ -1,0 +1,112 @@
+"""Where compiled code is cached when neither the package nor the user's cache can be written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from copem_replay.core import compiled
+from tests.helpers.experiments import TEXT, drive
+from tests.system.test_cli import Call, call, raising
+
+__all__ = ["call"]  # a fixture
+
+PACKAGE = Path(compiled.__file__).parent
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package, beside whose files nothing can be cached, not even by root: that is a file."""
+    folder = tmp_path_factory.mktemp("sealed")
+    shutil.copytree(PACKAGE, folder / "copem_replay", ignore=shutil.ignore_patterns("__pycache__"))
+    for place in [folder / "copem_replay", *(path.parent for path in (folder / "copem_replay").glob("*/__init__.py"))]:
+        (place / "__pycache__").touch()
+    return folder
+
+
+@pytest.fixture
+def run(sealed: Path, tmp_path: Path) -> Run:
+    """A command of that package, of a user whose home is no folder."""
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "e.yaml").write_text(TEXT)
+    (tmp_path / "tmp").mkdir()
+    nowhere = {"HOME": "/dev/null", "TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": str(sealed)}
+    clean = {name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+
+    def ran(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-B", "-m", "copem_replay.cli.main", *arguments],
+            cwd=tmp_path, env=clean | nowhere | environment, capture_output=True, text=True, timeout=100,
+        )  # fmt: skip
+
+    return ran
+
+
+def note(sealed: Path, where: str) -> str:
+    package = sealed / "copem_replay"
+    begin = f"note: compiled code is cached in {where}, as neither {package} nor /dev/null/.cache can be written"
+    return f"{begin}; NUMBA_CACHE_DIR names another\n"
+
+
+def test_a_folder_of_the_users_own_under_the_temporary_one(run: Run, sealed: Path, tmp_path: Path) -> None:
+    folder = tmp_path / f"tmp/copem_replay-{os.geteuid()}"
+    for _ in range(2):
+        ended = run("check", "e.yaml")
+        assert (ended.returncode, ended.stderr) == (0, note(sealed, str(folder)))
+        assert folder.stat().st_mode & 0o777 == 0o700
+        assert any(path.name.startswith("copem_replay_") for path in folder.iterdir()), "Numba's, for the package"
+    assert run("--help").stderr == "", "nothing is compiled"
+
+
+@pytest.mark.parametrize("kind", ["link", "others may write", "of another user", "file"])
+def test_a_folder_that_is_not_the_users_alone_is_not_used(run: Run, sealed: Path, tmp_path: Path, kind: str) -> None:
+    """What is in a cache is run."""
+    folder = tmp_path / f"tmp/copem_replay-{os.geteuid()}"
+    (tmp_path / "theirs").mkdir(mode=0o700)
+    if kind == "link":
+        folder.symlink_to(tmp_path / "theirs")
+    elif kind == "file":
+        folder.touch()
+    else:
+        folder.mkdir(mode=0o700)
+        if kind == "others may write":
+            folder.chmod(0o770)
+        elif os.geteuid():
+            pytest.skip("only root can give a folder to another user")
+        else:
+            os.chown(folder, 65534, 65534)
+    ended = run("check", "e.yaml")
+    assert ended.returncode == 0
+    assert f"{folder}-" in ended.stderr
+    assert f" for this process alone ({folder} is not a folder of this user alone), as neither " in ended.stderr
+    assert os.listdir(tmp_path / "tmp") == [folder.name], "that of the process has gone with it"
+    assert os.listdir(tmp_path / "theirs") == []
+    assert kind == "file" or os.listdir(folder) == []
+
+
+def test_a_folder_that_was_named_is_taken(run: Run, tmp_path: Path) -> None:
+    ended = run("check", "e.yaml", NUMBA_CACHE_DIR=str(tmp_path / "mine"))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert os.listdir(tmp_path / "mine") != []
+    assert os.listdir(tmp_path / "tmp") == []
+
+
+def test_the_users_cache_is_taken_as_ever(run: Run, tmp_path: Path) -> None:
+    ended = run("check", "e.yaml", HOME=str(tmp_path / "home"))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert os.listdir(tmp_path / "home/.cache/numba") != []
+    assert os.listdir(tmp_path / "tmp") == []
+
+
+def test_not_even_a_temporary_folder(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = RuntimeError("cannot cache function 'assign': no locator available for file 'core/assignment.py'")
+    monkeypatch.setattr("copem_replay.experiment.draft.survey.survey", raising(error))
+    line = "copem-replay: no folder to cache compiled code in; set NUMBA_CACHE_DIR to one that can be written"
+    assert call("info", "drive.mcap") == (2, "", [line])

@@ -1,0 +1,292 @@
+"""What `info` says of a recording, as data and as lines."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from copem_replay.experiment.draft.survey import describe, survey
+from tests.helpers.recordings import SHARED, Obj, Topic, pedestrian, truth_topic, write_mcap, write_recording
+
+# A car at 10 m/s for 1.5 s, a pedestrian who is there at 0, 0.25 and 1.5 s, a cone; no list at 1 s.
+CONE = Obj(id=9, x=5, y=3, z=0.35, length=0.4, width=0.4, height=0.7, stationary=True)
+FRAMES = [
+    (t, [Obj(id=4, x=10 * t, vx=10, length=4.5), CONE, *([pedestrian(7, 30)] if t in (0, 0.25, 1.5) else [])])
+    for t in (0, 0.25, 0.5, 0.75, 1.25, 1.5)
+]
+EXPERIMENT = """\
+version: 1
+logs: [LOG]
+pems: {eyes: [{detection: {kind: visible_share}, error: {kind: gaussian, covariance_m2: [[1.0, 0.0], [0.0, 1.0]]}}]}
+units:
+  ego: {on: ego, pem: eyes}
+  rsu: {recorded: {topic: rsu, delay_s: 0.0}}
+configurations:
+  GT: {units: truth}
+  PEM: {units: [ego]}
+  coPEM: {units: [ego, rsu]}
+measure: {objects: {classes: [vru]}}
+"""
+RSU = Topic("rsu", "osi3.SensorData", [(0, b""), (1, b"")])
+ODOMETRY = Topic("/odom", "nav_msgs/msg/Odometry", [(0, b"x")], "cdr")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.mcap"
+
+
+def test_survey(path):
+    write_recording(path, FRAMES, host=4, more=[RSU, ODOMETRY])
+    found = survey(path)
+    assert found == {
+        "recording": "log.mcap",
+        "readable": True,
+        "reason": None,
+        "choice": None,
+        "damage": None,
+        "topics": [
+            {
+                "topic": "truth",
+                "schema": "osi3.GroundTruth",
+                "encoding": "protobuf",
+                "messages": 6,
+                "role": "truth",
+            },
+            {"topic": "rsu", "schema": "osi3.SensorData", "encoding": "protobuf", "messages": 2, "role": "unit"},
+            {
+                "topic": "/odom",
+                "schema": "nav_msgs/msg/Odometry",
+                "encoding": "cdr",
+                "messages": 1,
+                "role": "poses",
+            },
+        ],
+        "proposals": [],
+        "truth": [
+            {
+                "topic": "truth",
+                "frames": 6,
+                "states": 15,
+                "start_ns": 0,
+                "span_s": 1.5,
+                "rate_hz": 4.0,
+                "longest_gap_s": 0.5,
+                "longest_gap_at_s": 0.75,
+                "x_m": [0.0, 30.0],
+                "y_m": [0.0, 3.0],
+                "gaps_inside_tracks": 1,
+                "moving": {"pedestrian": 1, "car": 1},
+                "stationary": {"other": 1},
+                "host_id": "4",
+                "ego": {"id": "4", "class": "car", "size_m": [4.5, 2.0, 1.5], "from_s": 0.0, "to_s": 1.5},
+                "missing": [],
+                "damage": None,
+                "notes": ["1 message of nav_msgs/msg/Odometry not read"],
+                "vehicles": "4 (car), 7 (pedestrian)",
+                "units": [
+                    {
+                        "topic": "rsu",
+                        "lists": 2,
+                        "entries": 0,
+                        "covariances_said": True,
+                        "captures_said": False,
+                        "problem": None,
+                    }
+                ],
+                "suggested": {
+                    "ego": None,
+                    "ego_why": "the log names its host vehicle: 4 (car)",
+                    "classes": ["vru"],
+                    "onset": "in_range",
+                    "masts": [
+                        {"at": [40.0, 0.0], "yaw_deg": 180},
+                        {"at": [20.0, 0.0], "yaw_deg": 0},
+                    ],
+                },
+            }
+        ],
+        "log": str(path),
+        "experiment": EXPERIMENT.replace("LOG", str(path)),
+    }
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert survey(path) == found
+
+
+def test_describe(path):
+    write_recording(path, FRAMES, host=4, more=[RSU, ODOMETRY])
+    assert describe(survey(path)) == [
+        "log.mcap",
+        "  topic  schema                 encoding  messages",
+        "  truth  osi3.GroundTruth       protobuf         6  the truth",
+        "  rsu    osi3.SensorData        protobuf         2  lists of a unit, for `recorded: {topic: …}`",
+        "  /odom  nav_msgs/msg/Odometry  cdr              1  poses",
+        "truth: truth",
+        "  6 frames, 1.500 s, 4.00 Hz (median), longest gap 0.500 s at 0.750 s",
+        "  within x 0 … 30 m, y 0 … 3 m",
+        "  1 gap above 0.5 s inside tracks",
+        "  moving: 1 pedestrian, 1 car",
+        "  stationary: 1 other",
+        "  ego: 4 (car, 4.50 × 2.00 × 1.50 m), 0.000 – 1.500 s",
+        "  unit rsu: 2 lists, 0 entries; says not when captured",
+        "  note: 1 message of nav_msgs/msg/Odometry not read",
+        f"experiment; with comments: copem-replay init {path} > experiment.yaml",
+        *(f"  {line}" for line in EXPERIMENT.replace("LOG", str(path)).splitlines()),
+    ]
+
+
+def test_no_ego_says_how_to_give_one(path):
+    write_recording(path, FRAMES)
+    (truth,) = survey(path)["truth"]
+    assert (truth["ego"], truth["host_id"]) == (None, None)
+    assert truth["missing"] == [
+        "no ego vehicle: the log names no host vehicle; "
+        "give `ego: <id>` in the experiment, or `--ego <id>`, of 4 (car), 7 (pedestrian)"
+    ]
+    assert f"  missing: {truth['missing'][0]}" in describe(survey(path))
+
+
+def test_a_host_that_is_nobody(path):
+    write_recording(path, FRAMES, host=114)
+    (truth,) = survey(path)["truth"]
+    assert (truth["ego"], truth["host_id"]) == (None, "114")
+    assert truth["missing"][0].startswith("no ego vehicle: the host vehicle 114 is no moving object; give `ego: <id>`")
+
+
+def test_one_frame_has_neither_rate_nor_gap(path):
+    write_recording(path, FRAMES[:1], host=4)
+    (truth,) = survey(path)["truth"]
+    assert (truth["rate_hz"], truth["longest_gap_s"], truth["longest_gap_at_s"]) == (None, None, None)
+    assert "  1 frame, 0.000 s" in describe(survey(path))
+
+
+def test_a_choice_between_truths_shows_them_all(path):
+    write_recording(path, FRAMES, more=[truth_topic(FRAMES[:2], name="other")])
+    found = survey(path)
+    assert found["readable"]
+    assert [(t["topic"], t["frames"]) for t in found["truth"]] == [("truth", 6), ("other", 2)]
+    lines = describe(found)
+    assert "truth: other" in lines
+    assert found["choice"] in lines
+    assert found["choice"].endswith("choose one with `read: {topic: …}` in the experiment")
+
+
+def test_several_truths_and_none_usable(path):
+    empty = [(0.0, [])]
+    write_recording(path, empty, more=[truth_topic(empty, name="other")])
+    found = survey(path)
+    assert not found["readable"]
+    assert found["reason"] == (
+        f"{path}: truth: no usable object in 1 message; {path}: other: no usable object in 1 message"
+    )
+
+
+def test_sensor_views_beside_a_ground_truth_are_not_looked_into(path):
+    write_recording(path, FRAMES, more=[truth_topic(FRAMES, name="view", schema="osi3.SensorView")])
+    assert [t["topic"] for t in survey(path)["truth"]] == ["truth"]
+
+
+def test_no_truth_says_what_there_is(path):
+    write_mcap(path, [ODOMETRY, RSU])
+    found = survey(path)
+    assert not found["readable"]
+    reason = found["reason"]
+    assert reason == (
+        f"{path}: no list of true objects; it holds nav_msgs/msg/Odometry (cdr) on /odom, osi3.SensorData on rsu; "
+        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
+    )
+    assert describe(found) == [
+        "log.mcap",
+        "  topic  schema                 encoding  messages",
+        "  /odom  nav_msgs/msg/Odometry  cdr              1  poses",
+        "  rsu    osi3.SensorData        protobuf         2  lists of a unit, for `recorded: {topic: …}`",
+    ]
+
+
+def test_every_topic_has_a_role(path):
+    """Unit lists of what this project wrote are not looked into; nor is a GroundTruth's SensorView."""
+    more = [
+        RSU,
+        ODOMETRY,
+        truth_topic(FRAMES, name="view", schema="osi3.SensorView"),
+        Topic("copem/PEM/objects", "osi3.SensorData", [(0, b"\xff")]),
+        Topic("copem/PEM/scene", "foxglove.SceneUpdate", [(0, b"")]),
+        Topic("/tf", "tf2_msgs/TFMessage", [(0, b"")], "cdr"),
+        Topic("/tracks", "autoware_perception_msgs/msg/TrackedObjects", [(0, b"")], "cdr"),
+        Topic("/camera", "sensor_msgs/msg/Image", [(0, b"")], "cdr"),
+    ]
+    write_recording(path, FRAMES, host=4, more=more)
+    found = survey(path)
+    assert {t["topic"]: t["role"] for t in found["topics"]} == {
+        "truth": "truth",
+        "view": "truth",
+        "rsu": "unit",
+        "copem/PEM/objects": "unit",
+        "copem/PEM/scene": "unit",
+        "/tracks": "unit",
+        "/odom": "poses",
+        "/tf": "poses",
+        "/camera": "unread",
+    }
+    (truth,) = found["truth"]
+    assert [(u["topic"], u["problem"] is None) for u in truth["units"]] == [("rsu", True), ("/tracks", False)]
+    lines = describe(found)
+    assert [line.split("  ")[-1] for line in lines[2:4]] == ["the truth", "lists of a unit, for `recorded: {topic: …}`"]
+    assert any(line.startswith("  view ") and line.endswith("truth, too, but not taken") for line in lines)
+    assert any(line.startswith("  unit /tracks: ") for line in lines)
+    assert "  note: 1 message of sensor_msgs/msg/Image not read" in lines
+
+
+def test_truth_without_usable_objects(path):
+    write_recording(path, [(0, [Obj(length=0)])])
+    found = survey(path)
+    assert not found["readable"]
+    assert found["reason"].startswith(f"{path}: truth: no usable object in 1 message; 1 object state whose length")
+    assert found["topics"][0]["role"] == "truth"
+
+
+FOLDER = "expected a recording, found a folder without metadata.yaml"
+
+
+def test_files_that_are_none(path, tmp_path):
+    for where, why in ((path, "no such file"), (tmp_path, FOLDER)):
+        found = survey(where)
+        assert (found["readable"], found["topics"], found["truth"]) == (False, [], [])
+        assert found["reason"] == f"{where}: {why}"
+        assert describe(found) == [where.name]
+
+
+def test_damage_is_said_once(path):
+    write_recording(path, FRAMES, host=4, chunk_size=1, finish=False)
+    found = survey(path)
+    assert found["readable"]
+    assert found["damage"] == "damaged after 1.500 s: 6 messages read (the file ends too early)"
+    assert [line for line in describe(found) if "damaged" in line] == [f"  note: {found['damage']}"]
+
+
+def test_survey_is_quick_and_light(path):
+    """In a fresh process, imports included; the heavy libraries stay out."""
+    frames = [(k / 10, [Obj(id=i, x=i * 9 + k, vx=10) for i in range(30)]) for k in range(300)]
+    write_recording(path, frames, host=0)
+    code = (
+        "import sys; from copem_replay.experiment.draft.survey import describe, survey; describe(survey(sys.argv[1]));"
+        "print([m for m in ('pandas', 'numba', 'scipy', 'pydantic', 'shapely', 'rerun') if m in sys.modules])"
+    )
+    began = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert time.perf_counter() - began < 5  # 0.3 s on an idle machine; a second is what is promised
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("path", sorted(SHARED.glob("*.mcap")) or [None], ids=lambda p: p.stem if p else "absent")
+def test_real_recordings_fit_a_screen(path):
+    if path is None:
+        pytest.skip("shared/data with recordings is not beside the project")
+    found = survey(path)
+    assert found["readable"]
+    json.dumps(found, allow_nan=False)
+    assert "unread" not in [t["role"] for t in found["topics"] if "Map" not in t["schema"]]
+    assert len(describe(found)) <= 30

@@ -1,0 +1,395 @@
+"""`copem-replay init`: whatever the recording, the experiment it writes passes `check` and runs; that of `info` too."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from osi3.osi_sensordata_pb2 import SensorData
+
+from copem_replay.cli import main as cli
+from copem_replay.core import yaml as plain_yaml
+from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.template import commented, quoted, short
+from tests.helpers.experiments import drive
+from tests.helpers.recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
+
+Frames = list[tuple[float, list[Obj]]]
+
+
+class Ended(NamedTuple):
+    code: int
+    out: str
+    err: list[str]
+
+
+Call = Callable[..., Ended]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Call:
+    """Run a command in this process, from `tmp_path`."""
+    monkeypatch.chdir(tmp_path)
+
+    def called(*arguments: str | Path) -> Ended:
+        monkeypatch.setattr(sys, "argv", ["copem-replay", *map(str, arguments)])
+        capsys.readouterr()
+        code = cli._ended()
+        out, err = capsys.readouterr()
+        return Ended(code, out, err.splitlines())
+
+    return called
+
+
+@pytest.fixture
+def replayed(call: Call, tmp_path: Path) -> Callable[[str | Path], dict[str, Any]]:
+    """Init, check and run a recording, and what `info` ends with, too; gives the experiment as data."""
+
+    def through(log: str | Path) -> dict[str, Any]:
+        made = call("init", log)
+        assert (made.code, made.err) == (0, [])
+        experiments = {"long": made.out, "short": survey(log)["experiment"]}
+        for name, text in experiments.items():
+            (tmp_path / f"{name}.yaml").write_text(text, encoding="utf-8")
+            checked = call("check", f"{name}.yaml")
+            assert checked.code == 0
+            run = call("run", f"{name}.yaml", "--runs", "2", "--jobs", "1", "--overwrite")
+            assert run.code == 0, run.err
+            assert [line for line in checked.err if line not in run.err] == [], "check says nothing that run does not"
+        data, _lines, problems = plain_yaml.read(made.out)
+        assert problems == []
+        return data  # type: ignore[no-any-return]
+
+    return through
+
+
+def street(*, host: int | None = None, seconds: int = 4, far_m: float = 0.0) -> Frames:
+    """Car 1 drives at 10 m/s for the whole time, car 2 for half of it, car 3 stands; pedestrian 7 stands aside."""
+    frames: Frames = []
+    for k in range(seconds * 10 + 1):
+        t = k / 10
+        objects = [
+            Obj(id=1, x=10 * t, vx=10),
+            Obj(id=3, x=20, y=9),
+            pedestrian(7, 30, 6 + far_m),
+        ]
+        frames.append((t, [*objects, *([Obj(id=2, x=40 - 12 * t, y=-4, vx=-12)] if t < seconds / 2 else [])]))
+    return frames
+
+
+def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", street(), host=2)
+    experiment = replayed("log.mcap")
+    assert "ego" not in experiment
+    assert experiment["logs"] == ["log.mcap"]
+    assert experiment["units"]["ego"]["on"] == "ego"
+    assert list(experiment["configurations"]) == ["GT", "PEM", "coPEM:0s", "coPEM:0.5s", "gnn:0.5s"]
+    assert experiment["measure"]["objects"] == {"classes": ["vru"]}
+    assert "# ego: <id>   # left out: the log names its host vehicle: 2 (car)" in commented(survey("log.mcap"))
+
+
+def test_the_mast_stands_beside_whom_it_looks_at(tmp_path: Path) -> None:
+    """Pedestrian 7 is at (30, 6), all drive along y = 0 and −4: 10 m to his north-east nobody else is nearer."""
+    write_recording(tmp_path / "log.mcap", street(), host=1)
+    (truth,) = survey(tmp_path / "log.mcap")["truth"]
+    first, second = truth["suggested"]["masts"]
+    assert first == {"at": [37.1, 13.1], "yaw_deg": -135}
+    assert second == {"at": [22.9, -1.1], "yaw_deg": 45}
+
+
+def test_without_a_host_whoever_drives_longest_and_it_is_said(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    """Car 3 is there as long as car 1, but stands."""
+    write_recording(tmp_path / "log.mcap", street())
+    assert replayed("log.mcap")["ego"] == 1
+    lines = commented(survey("log.mcap")).splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("ego: "))
+    assert lines[at - 1 : at + 2] == [
+        "# the log names no host vehicle; of the vehicles that drive, 1 (car) is there longest, 0.0 – 4.0 s",
+        "ego: 1   # a guess; none: no ego, a mast judged by itself",
+        "# ego: <id>   # of 1 (car), 3 (car), 2 (car), 7 (pedestrian)",
+    ]
+
+
+def test_a_host_that_is_nobody(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", street(), host=9)
+    assert replayed("log.mcap")["ego"] == 1
+    assert "# the log's host vehicle 9 is no moving object; of the" in commented(survey("log.mcap"))
+
+
+def test_the_only_one_that_moves_is_measured_not_the_ego(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", [(k / 10, [Obj(id=1, x=k, vx=10)]) for k in range(30)])
+    experiment = replayed("log.mcap")
+    assert experiment["ego"] == "none"
+    assert list(experiment["units"]) == ["roadside", "across"]
+    assert experiment["measure"]["distance_to"] == "roadside"
+    assert experiment["measure"]["objects"] == {"classes": ["vehicles"]}
+
+
+@pytest.mark.parametrize(("last_s", "ego"), [(4.4, "none"), (4.6, 1)])
+def test_a_roadside_unit_has_no_ego(tmp_path: Path, replayed: Callable[..., Any], last_s: float, ego: Any) -> None:
+    """Cars come by, each for two of six seconds; car 1 for three quarters of them, or for a little less."""
+    frames: Frames = []
+    for k in range(61):
+        t = k / 10
+        there = [Obj(id=n, x=12 * (t - 2 * n), y=4.0 * n, vx=12) for n in (2, 3, 4) if 0 <= t - 2 * (n - 2) <= 2]
+        frames.append((t, [pedestrian(7, 30, 6), *there, *([Obj(id=1, x=9 * t, vx=9)] if t <= last_s else [])]))
+    write_recording(tmp_path / "log.mcap", frames)
+    assert replayed("log.mcap")["ego"] == ego
+    text = commented(survey("log.mcap"))
+    assert ("1 (car) is there longest, 0.0 – 4.4 s of 6.0 s, and an ego is there nearly" in text) == (ego == "none")
+    assert "# ego: <id>   # of 2 (car), 1 (car), 3 (car), 4 (car), 7 (pedestrian)" in text
+
+
+def test_no_vehicle_no_ego(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    frames = [(k / 10, [pedestrian(7, k / 10), pedestrian(8, 5)]) for k in range(30)]
+    write_recording(tmp_path / "log.mcap", frames)
+    assert replayed("log.mcap")["ego"] == "none"
+
+
+def test_nobody_near_is_measured_when_he_appears(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    frames = [(t, [o for o in objects if o.id in (1, 7)]) for t, objects in street(far_m=500)]
+    write_recording(tmp_path / "log.mcap", frames, host=1)
+    assert replayed("log.mcap")["measure"]["onset"] == {"kind": "appears"}
+
+
+def test_vehicles_where_no_pedestrian_comes_near(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", street(far_m=500), host=1)
+    assert replayed("log.mcap")["measure"]["objects"] == {"classes": ["vehicles"]}
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [(0.0, [Obj(id=1)])],
+        [(k / 10, [Obj(id=1, x=k)]) for k in range(9)],
+        [(k / 10, [Obj(id=1, x=k), Obj(id=2, x=3, stationary=True)]) for k in range(9)],
+    ],
+    ids=["one frame", "only the ego", "nothing else moves"],
+)
+@pytest.mark.parametrize("host", [1, None])
+def test_nothing_to_measure_runs_all_the_same(
+    tmp_path: Path, replayed: Callable[..., Any], frames: Frames, host: int | None
+) -> None:
+    write_recording(tmp_path / "log.mcap", frames, host=host)
+    replayed("log.mcap")
+
+
+def test_of_several_truths_the_fullest_and_the_others_are_named(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", street()[:3], host=1, more=[truth_topic(street(), name="full", host=1)])
+    assert replayed("log.mcap")["read"] == {"topic": "full"}
+    assert "# read: {topic: truth}   # could be it, too" in commented(survey("log.mcap"))
+
+
+def unit(name: str, *, covariance: bool = False, captured: bool = False) -> Topic:
+    """Pedestrian 7 as a unit lists him, ten times a second."""
+    messages = []
+    for k in range(41):
+        data = SensorData()
+        data.timestamp.seconds, data.timestamp.nanos = divmod(ns(k / 10), 10**9)
+        if captured:
+            data.last_measurement_time.CopyFrom(data.timestamp)
+        item = data.moving_object.add()
+        item.header.tracking_id.value = 1
+        item.base.position.x, item.base.position.y = 30.2, 6.1
+        item.base.dimension.length = item.base.dimension.width = 0.6
+        if covariance:
+            item.base_rmse.position.x = item.base_rmse.position.y = 0.3
+        messages.append((ns(k / 10), data.SerializeToString()))
+    return Topic(name, "osi3.SensorData", messages)
+
+
+def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    """Named by what their topics say; what their messages don't say is to be filled in; what cannot be read is said."""
+    more = [
+        unit("mcity.RSU.SensorData"),
+        unit("/obu/front objects", covariance=True, captured=True),
+        unit("ego/objects", covariance=True, captured=True),
+        Topic("broken", "osi3.SensorData", [(0, b"\xff\xff")]),
+        Topic("silent", "osi3.SensorData", []),
+    ]
+    write_recording(tmp_path / "log.mcap", street(), host=1, more=more)
+    experiment = replayed("log.mcap")
+    recorded = {name: u["recorded"] for name, u in experiment["units"].items() if "recorded" in u}
+    assert recorded == {
+        "rsu": {"topic": "mcity.RSU.SensorData", "delay_s": 0.0, "covariance_m2": [[0.5, 0.0], [0.0, 0.5]]},
+        "front": {"topic": "/obu/front objects"},
+        "ego2": {"topic": "ego/objects"},
+    }
+    assert experiment["configurations"]["with rsu"] == {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}
+    assert "  # broken cannot be a unit: " in commented(survey("log.mcap"))
+
+
+# What other writers have, as JSON: no definition is needed to write it
+
+
+def scene_update(name: str, frame: str = "map", *, classes: bool = True) -> Topic:
+    """Pedestrian 7 stands at (30, 6), car 2 comes along y = −4."""
+    messages = []
+    for k in range(41):
+        entities = [
+            _entity("7", k, frame, "pedestrian" if classes else None, (30, 6, 0.9), (0.6, 0.6, 1.8)),
+            _entity("2", k, frame, "car" if classes else None, (40 - 0.8 * k, -4, 0.75), (4.5, 1.8, 1.5)),
+        ]
+        messages.append((ns(k / 10), json.dumps({"entities": entities}).encode()))
+    return Topic(name, "foxglove.SceneUpdate", messages, "json")
+
+
+def _stamp(k: int) -> dict[str, int]:
+    return {"sec": k // 10, "nsec": k % 10 * 10**8}
+
+
+def _xyz(values: tuple[float, ...]) -> dict[str, float]:
+    return dict(zip("xyz", values, strict=True))
+
+
+_UPRIGHT = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+
+
+def _entity(
+    name: str, k: int, frame: str, kind: str | None, at: tuple[float, ...], size: tuple[float, ...]
+) -> dict[str, Any]:
+    cube = {"pose": {"position": _xyz(at), "orientation": _UPRIGHT}, "size": _xyz(size)}
+    metadata = [{"key": "class", "value": kind}] if kind else []
+    return {"id": name, "timestamp": _stamp(k), "frame_id": frame, "metadata": metadata, "cubes": [cube]}
+
+
+def poses(name: str) -> Topic:
+    """Along x at 10 m/s."""
+    messages = []
+    for k in range(41):
+        pose = {"position": _xyz((float(k), 0.0, 0.0)), "orientation": _UPRIGHT}
+        messages.append((ns(k / 10), json.dumps({"timestamp": _stamp(k), "frame_id": "map", "pose": pose}).encode()))
+    return Topic(name, "foxglove.PoseInFrame", messages, "json")
+
+
+def transforms(name: str, *children: str) -> Topic:
+    messages = []
+    for k in range(41):
+        for child in children:
+            said = {"timestamp": _stamp(k), "parent_frame_id": "map", "child_frame_id": child}
+            said |= {"translation": _xyz((float(k), 0.0, 0.0)), "rotation": _UPRIGHT}
+            messages.append((ns(k / 10), json.dumps(said).encode()))
+    return Topic(name, "foxglove.FrameTransform", messages, "json")
+
+
+def test_poses_may_be_the_egos(tmp_path: Path, replayed: Callable[..., Any], call: Call) -> None:
+    write_mcap(tmp_path / "log.mcap", [scene_update("/objects"), poses("/pose")])
+    experiment = replayed("log.mcap")
+    assert experiment["ego"] == {"topic": "/pose"}
+    assert experiment["measure"]["objects"] == {"classes": ["vru"]}
+    text = commented(survey("log.mcap"))
+    assert "ego:   # the log names no host vehicle; these poses may be the ego's\n  topic: /pose\n  # size_m: " in text
+    shown = call("info", "log.mcap").out
+    assert "the truth\n" in shown
+    assert "poses, of the ego it seems\n" in shown
+    assert "; or `ego: {topic: /pose}` (poses are on /pose)" in shown
+
+
+def test_transforms_by_the_frame_of_the_vehicle(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_mcap(tmp_path / "log.mcap", [scene_update("/objects"), transforms("/tf", "lidar", "base_link")])
+    assert replayed("log.mcap")["ego"] == {"topic": "/tf", "frame": "base_link"}
+
+
+def test_transforms_of_nothing_known_leave_the_ego_to_the_objects(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_mcap(tmp_path / "log.mcap", [scene_update("/objects"), transforms("/tf", "lidar", "camera")])
+    assert replayed("log.mcap")["ego"] == 2
+
+
+def test_one_of_two_scenes(tmp_path: Path, replayed: Callable[..., Any], call: Call) -> None:
+    """Either may be the truth; the other one's lists can be a unit's then."""
+    write_mcap(tmp_path / "log.mcap", [scene_update("/a"), scene_update("/b"), poses("/pose")])
+    assert replayed("log.mcap")["read"] == {"topic": "/a"}
+    assert call("info", "log.mcap").out.count("may be the truth: `read: {topic: …}`") == 2
+
+
+def test_lists_beside_the_truth_of_another_format(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", street(), host=1, more=[scene_update("/radar/objects")])
+    experiment = replayed("log.mcap")
+    assert experiment["units"]["radar"]["recorded"]["topic"] == "/radar/objects"
+
+
+def test_own_results_are_no_units(tmp_path: Path, call: Call, replayed: Callable[..., Any]) -> None:
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "e.yaml").write_text(call("init", "drive.mcap").out, encoding="utf-8")
+    assert call("run", "e.yaml", "--runs", "2", "--jobs", "1").code == 0
+    assert list(replayed("out/e/replay.mcap")["units"]) == ["ego", "roadside"]
+
+
+@pytest.mark.parametrize(
+    "name", ["a b.mcap", "q\"'s\\.mcap", "[x]*.mcap", "ünd: #1.mcap", "2.5", "new\nline.mcap", "null"]
+)
+def test_file_names_of_any_kind(tmp_path: Path, replayed: Callable[..., Any], name: str) -> None:
+    drive(tmp_path / name)
+    assert replayed(name)["logs"] == [name]
+
+
+@pytest.mark.parametrize("name", ["a b", "q\"'s", "{x}, [y]", "ünd: #1", "2.5", "new\nline", "null", "-"])
+def test_topics_of_any_kind(tmp_path: Path, replayed: Callable[..., Any], name: str) -> None:
+    more = [truth_topic(street()[:2], name="other"), unit(f"{name}/unit")]
+    write_recording(tmp_path / "log.mcap", street(), topic=name, host=1, more=more)
+    assert replayed("log.mcap")["read"] == {"topic": name}
+
+
+def test_paths_are_as_given(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    drive(tmp_path / "sub" / "drive.mcap")
+    for log in ("sub/drive.mcap", "sub/../sub/drive.mcap", str(tmp_path / "sub" / "drive.mcap")):
+        assert replayed(log)["logs"] == [log]
+
+
+def test_a_damaged_log_as_far_as_it_goes(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    write_recording(tmp_path / "log.mcap", street(), host=1, chunk_size=1, finish=False)
+    replayed("log.mcap")
+
+
+def test_what_cannot_be_replayed_is_one_line(tmp_path: Path, call: Call) -> None:
+    (tmp_path / "empty.mcap").touch()
+    write_mcap(tmp_path / "poses.mcap", [poses("/pose")])
+    write_recording(tmp_path / "nothing.mcap", [(0.0, [])])
+    (tmp_path / "e.yaml").write_text("version: 1\n")
+    for name in ("none.mcap", "empty.mcap", "poses.mcap", "nothing.mcap", "e.yaml", "."):
+        ended = call("init", name)
+        assert (ended.code, ended.out) == (2, "")
+        (line,) = ended.err
+        assert line.startswith(f"{name}: ")
+        shown = call("info", name)
+        assert shown.code == 2
+        assert "experiment" not in shown.out
+
+
+def test_usage(call: Call, tmp_path: Path) -> None:
+    drive(tmp_path / "drive.mcap")
+    for arguments, said in (([], "Missing argument 'LOG'."), (["a", "b"], "unexpected extra argument")):
+        ended = call("init", *arguments)
+        assert (ended.code, ended.out) == (2, "")
+        assert said in ended.err[0]
+    assert call("init", "--help").out.startswith("Usage: copem-replay init ")
+    assert call("init", "drive.mcap").out == call("init", "drive.mcap").out
+
+
+@given(st.text(st.characters(exclude_categories=["Cs"])))
+def test_quoted_text_reads_as_the_same_text(text: str) -> None:
+    data, _lines, problems = plain_yaml.read(f"a: [{quoted(text)}]\nb: {quoted(text)}   # c\n")
+    assert problems == []
+    for value in (data["a"][0], data["b"]):
+        assert (value if isinstance(value, str) else str(value)) == text
+
+
+@pytest.mark.parametrize("path", sorted(SHARED.glob("*.mcap")) or [None], ids=lambda p: p.stem if p else "absent")
+def test_real_recordings(replayed: Callable[..., Any], path: Path | None) -> None:
+    if path is None:
+        pytest.skip(f"{SHARED} is not there")
+    found = survey(path)
+    assert len(short(found)) <= 13
+    assert all(len(line) <= 120 for line in short(found)[2:])
+    place = np.array([mast["at"] for mast in found["truth"][0]["suggested"]["masts"]])
+    (x0, x1), (y0, y1) = found["truth"][0]["x_m"], found["truth"][0]["y_m"]
+    assert ((place >= [x0 - 10, y0 - 10]) & (place <= [x1 + 10, y1 + 10])).all()
+    if path.stat().st_size < 300_000:  # the others take a while: the same commands by hand
+        replayed(path)

@@ -1,0 +1,1 @@
+"""What tests of several wings use: scenes, recordings, experiments made by hand."""

@@ -1,0 +1,544 @@
+"""Formats known by name: definitions as the packages have them (as far as they matter), values by hand."""
+
+import json
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.json_format import ParseDict
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from copem_replay.core.tracks import CLASSES
+from copem_replay.io.encodings.cdr import CdrDefinition
+from copem_replay.io.encodings.columns import Definition
+from copem_replay.io.encodings.json import JsonDefinition
+from copem_replay.io.encodings.protobuf import ProtobufDefinition
+from copem_replay.io.schemas.foxglove import SCHEMAS, description
+from copem_replay.io.schemas.object_lists import Listed, listed
+from copem_replay.io.schemas.ros2 import DESCRIPTIONS
+from tests.helpers.messages import SEPARATOR, classes, ids, quaternion, serialised, values
+
+COMMON = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Point32": "float32 x\nfloat32 y\nfloat32 z",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1",
+    "geometry_msgs/Pose": "Point position\nQuaternion orientation",
+    "geometry_msgs/PoseWithCovariance": "Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/Twist": "Vector3 linear\nVector3 angular",
+    "geometry_msgs/TwistWithCovariance": "Twist twist\nfloat64[36] covariance",
+    "geometry_msgs/Accel": "Vector3 linear\nVector3 angular",
+    "geometry_msgs/AccelWithCovariance": "Accel accel\nfloat64[36] covariance",
+    "geometry_msgs/Polygon": "geometry_msgs/Point32[] points",
+    "unique_identifier_msgs/UUID": "uint8[16] uuid",
+    "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
+}
+HEADER = {"stamp": {"sec": 1533151603, "nanosec": 547590000}, "frame_id": "map"}
+STAMP = 1533151603547590000
+
+
+def text_of(first: str, **others: str) -> str:
+    """The definition of a message with those it needs, and many it does not."""
+    parts = [f"MSG: {name.replace('__', '/')}\n{text}" for name, text in {**others, **COMMON}.items()]
+    return ("\n" + SEPARATOR).join([first, *parts]) + "\n"
+
+
+def written(name: str, text: str, *messages: dict[str, Any], encoding: str = "ros2msg", idl: str = "") -> Listed:
+    """Serialised by rosbags; the package of `text` is called p."""
+    text = text.replace("MSG: p/", f"MSG: {name.split('/')[0]}/")
+    definition = CdrDefinition(name, encoding, (idl or text).encode())
+    payloads = [serialised(text, m, name=name) for m in messages]
+    made = DESCRIPTIONS[name](definition.offers())
+    return listed(definition, made, payloads, np.arange(len(payloads), dtype=np.int64))
+
+
+def xyz(x: float = 0, y: float = 0, z: float = 0) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
+def matrix(*diagonal: float) -> list[float]:
+    return [diagonal[k // 7] if k % 7 == 0 and k // 7 < len(diagonal) else 0.0 for k in range(36)]
+
+
+# ------------------------------------------------------------------------------------------------ Autoware
+
+KINDS = "uint8 UNKNOWN = 0\nuint8 CAR = 1\nuint8 label\nfloat32 probability"
+SHAPE = "uint8 BOUNDING_BOX=0\nuint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions"
+KINEMATICS = {
+    "Detected": (
+        "geometry_msgs/PoseWithCovariance pose_with_covariance\nbool has_position_covariance\n"
+        "uint8 orientation_availability\ngeometry_msgs/TwistWithCovariance twist_with_covariance\nbool has_twist\n"
+        "bool has_twist_covariance"
+    ),
+    "Tracked": (
+        "geometry_msgs/PoseWithCovariance pose_with_covariance\n"
+        "geometry_msgs/TwistWithCovariance twist_with_covariance\n"
+        "geometry_msgs/AccelWithCovariance acceleration_with_covariance\nuint8 orientation_availability\n"
+        "bool is_stationary"
+    ),
+    "Predicted": (
+        "geometry_msgs/PoseWithCovariance initial_pose_with_covariance\n"
+        "geometry_msgs/TwistWithCovariance initial_twist_with_covariance\n"
+        "geometry_msgs/AccelWithCovariance initial_acceleration_with_covariance\nPath[] predicted_paths"
+    ),
+}
+ZERO = [0.0] * 36
+
+
+def autoware(kind: str) -> str:
+    ident = "" if kind == "Detected" else "unique_identifier_msgs/UUID object_id\n"
+    types = {
+        "p__Object": (
+            f"{ident}float32 existence_probability\nKind[] classification\nKinematics kinematics\nShape shape"
+        ),
+        "p__Kind": KINDS,
+        "p__Kinematics": KINEMATICS[kind],
+        "p__Shape": SHAPE,
+        "p__Path": "geometry_msgs/Pose[] path\nbuiltin_interfaces/Duration time_step\nfloat32 confidence",
+    }
+    return text_of("std_msgs/Header header\nObject[] objects", **types)
+
+
+def autoware_object(kind: str, number: int, **changes: Any) -> dict[str, Any]:
+    pose = {
+        "pose": {"position": xyz(10, 20, 0.75), "orientation": quaternion(math.pi / 2)},
+        "covariance": matrix(0.25, 0.5),
+    }
+    pose["covariance"][1] = pose["covariance"][6] = 0.1
+    twist = {"twist": {"linear": xyz(5, 1), "angular": xyz()}, "covariance": ZERO}
+    accel = {"accel": {"linear": xyz(), "angular": xyz()}, "covariance": ZERO}
+    path = {"path": [pose["pose"]] * 2, "time_step": {"sec": 0, "nanosec": 5}, "confidence": 1.0}
+    kinematics = {
+        "pose_with_covariance": pose,
+        "twist_with_covariance": twist,
+        "acceleration_with_covariance": accel,
+        "initial_pose_with_covariance": pose,
+        "initial_twist_with_covariance": twist,
+        "initial_acceleration_with_covariance": accel,
+        "orientation_availability": changes.get("orientation", 2),
+        "has_twist": changes.get("has_twist", True),
+        "has_twist_covariance": False,
+        "has_position_covariance": changes.get("has_covariance", True),
+        "is_stationary": False,
+        "predicted_paths": [path] * number,
+    }
+    return {
+        "object_id": {"uuid": [number] * 16},
+        "existence_probability": 0.5,
+        "classification": changes.get(
+            "classification", [{"label": 7, "probability": 0.75}, {"label": 6, "probability": 0.25}]
+        ),
+        "kinematics": kinematics,
+        "shape": changes.get("shape", {"type": 0, "footprint": {"points": []}, "dimensions": xyz(4, 2, 1.5)}),
+    }
+
+
+@pytest.mark.parametrize("kind", ["Detected", "Tracked", "Predicted"])
+@pytest.mark.parametrize("package", ["autoware_perception_msgs", "autoware_auto_perception_msgs"])
+def test_autoware(package: str, kind: str) -> None:
+    objects = [autoware_object(kind, 1), autoware_object(kind, 2, classification=[{"label": 3, "probability": 1.0}])]
+    message = {"header": HEADER, "objects": objects}
+    found = written(f"{package}/msg/{kind}Objects", autoware(kind), message, {**message, "objects": []})
+    assert found.columns.rows.tolist() == [2, 0]
+    assert found.columns.stamp_ns.tolist() == [STAMP, STAMP]
+    assert found.columns.stamped.all()
+    assert found.frames == ("map",)
+    assert [values(found, n)[0] for n in ("x_m", "y_m", "z_m", "yaw_rad")] == [10, 20, 0.75, math.pi / 2]
+    assert [values(found, n)[0] for n in ("vx_mps", "vy_mps")] == [-1, 5]  # along the object, which looks north
+    assert [values(found, n)[0] for n in ("length_m", "width_m", "height_m")] == [4, 2, 1.5]
+    assert classes(found) == ["pedestrian", "bus"]
+    assert found.probability[0, CLASSES.index("bicycle")] == pytest.approx(0.25)
+    assert found.existence.tolist() == [0.5, 0.5]
+    np.testing.assert_allclose(found.covariance_m2[0], [0.25, 0.1, 0.5])
+    assert ids(found) == (["0", "1"] if kind == "Detected" else ["01" * 16, "02" * 16])
+    assert found.columns.notes == ()
+
+
+def test_autoware_says_what_it_does_not_know() -> None:
+    objects = [
+        autoware_object("Detected", 1),
+        autoware_object("Detected", 2, orientation=0, has_twist=False, has_covariance=False),
+    ]
+    name = "autoware_perception_msgs/msg/DetectedObjects"
+    found = written(name, autoware("Detected"), {"header": HEADER, "objects": objects})
+    assert values(found, "vx_mps") == [-1, None]
+    assert values(found, "yaw_rad") == [math.pi / 2] * 2
+    assert np.isnan(found.covariance_m2).all(axis=1).tolist() == [False, True]
+    assert found.columns.notes == ("1 object state that does not say its heading: as written",)
+
+
+def test_autoware_shapes() -> None:
+    corners = [xyz(-1, -0.5), xyz(2, -0.5), xyz(2, 1.5), xyz(-1, 1.5)]
+    shapes = [
+        {"type": 1, "footprint": {"points": []}, "dimensions": xyz(0.6, 0.6, 1.8)},
+        {"type": 2, "footprint": {"points": corners}, "dimensions": xyz(0, 0, 1.2)},
+    ]
+    objects = [autoware_object("Tracked", k, shape=shape) for k, shape in enumerate(shapes)]
+    name = "autoware_perception_msgs/msg/TrackedObjects"
+    found = written(name, autoware("Tracked"), {"header": HEADER, "objects": objects})
+    assert values(found, "length_m") == [0.6, 3]
+    assert values(found, "width_m") == [0.6, 2]
+    assert values(found, "height_m") == [1.8, 1.2]
+    assert values(found, "x_m") == [10, 9.5]  # half a metre to its left, and it looks north
+    assert values(found, "y_m") == [20, 20.5]
+
+
+def test_autoware_auto_as_idl() -> None:
+    """The package is defined in IDL; rosbag2 records it so, file after file."""
+    package = "autoware_auto_perception_msgs"
+    geometry = {
+        "Point": "double x; double y; double z;",
+        "Point32": "float x; float y; float z;",
+        "Vector3": "double x; double y; double z;",
+        "Quaternion": "@default (value=0.0) double x; @default (value=0.0) double y; double z; double w;",
+        "Pose": "geometry_msgs::msg::Point position; geometry_msgs::msg::Quaternion orientation;",
+        "PoseWithCovariance": "geometry_msgs::msg::Pose pose; double__36 covariance;",
+        "Twist": "geometry_msgs::msg::Vector3 linear; geometry_msgs::msg::Vector3 angular;",
+        "TwistWithCovariance": "geometry_msgs::msg::Twist twist; double__36 covariance;",
+        "Accel": "geometry_msgs::msg::Vector3 linear; geometry_msgs::msg::Vector3 angular;",
+        "AccelWithCovariance": "geometry_msgs::msg::Accel accel; double__36 covariance;",
+        "Polygon": "sequence<geometry_msgs::msg::Point32> points;",
+    }
+    own = {
+        "TrackedObjects": f"std_msgs::msg::Header header; sequence<{package}::msg::TrackedObject> objects;",
+        "TrackedObject": (
+            "unique_identifier_msgs::msg::UUID object_id;\n@range (min=0.0, max=1.0)\nfloat existence_probability;\n"
+            f"sequence<{package}::msg::ObjectClassification> classification;\n"
+            f"{package}::msg::TrackedObjectKinematics kinematics; {package}::msg::Shape shape;"
+        ),
+        "ObjectClassification": "uint8 label; float probability;",
+        "TrackedObjectKinematics": (
+            "geometry_msgs::msg::PoseWithCovariance pose_with_covariance;\n@default (value=0)\n"
+            "uint8 orientation_availability;\n"
+            "geometry_msgs::msg::TwistWithCovariance twist_with_covariance;\n"
+            "geometry_msgs::msg::AccelWithCovariance acceleration_with_covariance;\nboolean is_stationary;"
+        ),
+        "Shape": "uint8 type; geometry_msgs::msg::Polygon footprint; geometry_msgs::msg::Vector3 dimensions;",
+    }
+
+    def module(package: str, name: str, body: str) -> str:
+        before = "typedef double double__36[36];" if "double__36" in body else ""
+        before += "typedef uint8 uint8__16[16];" if "uint8__16" in body else ""
+        if name == "ObjectClassification":
+            before += " module ObjectClassification_Constants { const uint8 UNKNOWN = 0; const uint8 CAR = 1; };"
+        note = '@verbatim (language="comment", text=\n "A list of them." "\\n" "It\'s << long.")'
+        return (
+            f'{SEPARATOR}IDL: {package}/msg/{name}\n// generated\n#include "std_msgs/msg/Header.idl"\n'
+            f"module {package} {{\n  module msg {{\n {before}\n{note}\n    struct {name} {{ {body} }};\n  }};\n}};\n"
+        )
+
+    idl = "".join(module(package, name, body) for name, body in own.items())
+    idl += "".join(module("geometry_msgs", name, body) for name, body in geometry.items())
+    idl += module("std_msgs", "Header", "builtin_interfaces::msg::Time stamp; string frame_id;")
+    idl += module("builtin_interfaces", "Time", "int32 sec; uint32 nanosec;")
+    idl += module("unique_identifier_msgs", "UUID", "uint8__16 uuid;")
+    in_msg = autoware("Tracked").replace(
+        KINEMATICS["Tracked"],
+        "geometry_msgs/PoseWithCovariance pose_with_covariance\nuint8 orientation_availability\n"
+        "geometry_msgs/TwistWithCovariance twist_with_covariance\n"
+        "geometry_msgs/AccelWithCovariance acceleration_with_covariance\nbool is_stationary",
+    )
+    message = {"header": HEADER, "objects": [autoware_object("Tracked", k) for k in (1, 2)]}
+    found = written(f"{package}/msg/TrackedObjects", in_msg, message, encoding="ros2idl", idl=idl)
+    assert ids(found) == ["01" * 16, "02" * 16]
+    assert found.columns.stamp_ns.tolist() == [STAMP]
+    assert values(found, "x_m") == [10, 10]
+    assert values(found, "vy_mps") == [5, 5]
+    assert values(found, "length_m") == [4, 4]
+    assert classes(found) == ["pedestrian"] * 2
+
+
+# ------------------------------------------------------------------------------------------------ vision_msgs
+
+BOX = {"p__Box": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size"}
+BOX_SAID = {"center": {"position": xyz(1, 2, 3), "orientation": quaternion(0.5)}, "size": xyz(4, 2, 1.5)}
+
+
+def test_detections_of_vision_msgs() -> None:
+    text = text_of(
+        "std_msgs/Header header\nDetection3D[] detections",
+        p__Detection3D="std_msgs/Header header\nResult[] results\nBox bbox\nstring id",
+        p__Result="Hypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+        p__Hypothesis="string class_id\nfloat64 score",
+        **BOX,
+    )
+    pose = {"pose": BOX_SAID["center"], "covariance": matrix(0.5, 2)}
+    results = [
+        {"hypothesis": {"class_id": "car", "score": 0.5}, "pose": pose},
+        {"hypothesis": {"class_id": "VEHICLE_TRUCK", "score": 0.25}, "pose": pose},
+    ]
+    detections = [
+        {"header": HEADER, "results": results, "bbox": BOX_SAID, "id": "17"},
+        {"header": HEADER, "results": [], "bbox": BOX_SAID, "id": "18"},
+    ]
+    name = "vision_msgs/msg/Detection3DArray"
+    found = written(name, text, {"header": HEADER, "detections": detections})
+    assert ids(found) == ["17", "18"]
+    assert classes(found) == ["car", "other"]
+    assert found.probability[0, CLASSES.index("truck")] == pytest.approx(1 / 3)
+    np.testing.assert_array_equal(found.existence, [0.5, np.nan])
+    np.testing.assert_array_equal(found.covariance_m2, [[0.5, 0, 2], [np.nan] * 3])
+    assert values(found, "yaw_rad") == [0.5, 0.5]
+    assert values(found, "vx_mps") == [None, None]
+    assert [values(found, n)[0] for n in ("x_m", "z_m", "length_m", "height_m")] == [1, 3, 4, 1.5]
+    unnamed = [{**d, "id": ""} for d in detections]
+    assert ids(written(name, text, {"header": HEADER, "detections": unnamed})) == ["0", "1"]
+
+
+@pytest.mark.parametrize(("ident", "label"), [("string", "person"), ("int64", 3)])
+def test_detections_of_old_vision_msgs(ident: str, label: Any) -> None:
+    """As of Foxy; before, classes were numbers, and nobody says of what."""
+    text = text_of(
+        "std_msgs/Header header\nDetection3D[] detections",
+        p__Detection3D="std_msgs/Header header\nResult[] results\nBox bbox\nbool is_tracking\nstring tracking_id",
+        p__Result=f"{ident} id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose",
+        **BOX,
+    )
+    pose = {"pose": BOX_SAID["center"], "covariance": ZERO}
+    detection = {"header": HEADER, "results": [{"id": label, "score": 0.5, "pose": pose}], "bbox": BOX_SAID}
+    detection |= {"is_tracking": True, "tracking_id": "t1"}
+    found = written("vision_msgs/msg/Detection3DArray", text, {"header": HEADER, "detections": [detection]})
+    assert ids(found) == ["t1"]
+    assert classes(found) == ["pedestrian" if ident == "string" else "other"]
+    assert found.existence.tolist() == [0.5]
+
+
+# ------------------------------------------------------------------------------------------------ others
+
+
+def test_derived_objects() -> None:
+    text = text_of(
+        "std_msgs/Header header\nObject[] objects",
+        p__Object=(
+            "std_msgs/Header header\nuint32 id\nuint8 detection_level\nbool object_classified\n"
+            "geometry_msgs/Pose pose\n"
+            "geometry_msgs/Twist twist\ngeometry_msgs/Accel accel\ngeometry_msgs/Polygon polygon\nSolid shape\n"
+            "uint8 classification\nuint8 classification_certainty\nuint32 classification_age"
+        ),
+        p__Solid="uint8 BOX=1\nuint8 type\nfloat64[<=3] dimensions\ngeometry_msgs/Polygon polygon",
+    )
+    still = {"linear": xyz(), "angular": xyz()}
+    item = {
+        "header": HEADER,
+        "id": 4294967295,
+        "detection_level": 2,
+        "object_classified": True,
+        "pose": {"position": xyz(1, 2, 3), "orientation": quaternion(math.pi / 2)},
+        "twist": {"linear": xyz(5, 1), "angular": xyz()},
+        "accel": still,
+        "polygon": {"points": [xyz()] * 3},
+        "shape": {"type": 1, "dimensions": [4, 2, 1.5], "polygon": {"points": []}},
+        "classification": 4,
+        "classification_certainty": 255,
+        "classification_age": 0,
+    }
+    round_ = {
+        kind: {**item, "id": kind, "shape": {**item["shape"], "type": kind, "dimensions": dimensions}}
+        for kind, dimensions in ((2, [0.5]), (3, [1.8, 0.25]), (4, [0.75, 0.2]))
+    }
+    other = {**item, "id": 7, "shape": {**item["shape"], "dimensions": []}, "classification": 9}
+    solids = written("derived_object_msgs/msg/ObjectArray", text, {"header": HEADER, "objects": [*round_.values()]})
+    assert values(solids, "length_m") == values(solids, "width_m") == [1, 0.5, 0.4]  # a sphere, a cylinder, a cone
+    assert values(solids, "height_m") == [1, 1.8, 0.75]
+    message = {"header": HEADER, "objects": [item, other]}
+    found = written("derived_object_msgs/msg/ObjectArray", text, message)
+    assert ids(found) == ["4294967295", "7"]
+    assert classes(found) == ["pedestrian", "vehicle"]
+    assert values(found, "vx_mps") == [5, 5]  # along the axes of the list
+    assert values(found, "length_m") == [4, None]
+    assert values(found, "height_m") == [1.5, None]
+
+
+def test_markers() -> None:
+    text = text_of(
+        "Marker[] markers",
+        p__Marker=(
+            "int32 CUBE=1\nstd_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\n"
+            "geometry_msgs/Pose pose\ngeometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\n"
+            "builtin_interfaces/Duration lifetime\nbool frame_locked\ngeometry_msgs/Point[] points\nstring text"
+        ),
+    )
+
+    def marker(ns: str, ident: int, kind: int, action: int) -> dict[str, Any]:
+        return {
+            "header": HEADER,
+            "ns": ns,
+            "id": ident,
+            "type": kind,
+            "action": action,
+            "pose": BOX_SAID["center"],
+            "scale": BOX_SAID["size"],
+            "color": {"r": 1, "g": 1, "b": 1, "a": 1},
+            "lifetime": {"sec": 0, "nanosec": 0},
+            "frame_locked": False,
+            "points": [xyz(1, 1)] * ident,
+            "text": "a cube",
+        }
+
+    markers = [marker("", 0, 0, 3), marker("car", 1, 1, 0), marker("pedestrian", 1, 1, 0), marker("car", 2, 9, 0)]
+    found = written("visualization_msgs/msg/MarkerArray", text, {"markers": markers}, {"markers": []})
+    assert ids(found) == ["car/1", "pedestrian/1"]
+    assert classes(found) == ["car", "pedestrian"]
+    assert found.columns.rows.tolist() == [2, 0]
+    assert found.columns.stamp_ns.tolist() == [STAMP, 1]
+    assert found.columns.stamped.tolist() == [True, False]
+    assert values(found, "length_m") == [4, 4]
+
+
+# ------------------------------------------------------------------------------------------------ SceneUpdate
+
+
+def scene(sec: str, nanosec: str) -> list[dict[str, Any]]:
+    """A message with three entities, one with two cubes, one with none; and one that only deletes."""
+    stamp = {sec: 1533151603, nanosec: 547590000}
+    cube = {"pose": {"position": xyz(1, 2, 3), "orientation": quaternion(0.5)}, "size": xyz(4, 2, 1.5)}
+    cube["color"] = {"r": 1, "g": 0.5, "b": 0, "a": 1}
+    entity = {"timestamp": stamp, "frame_id": "map", "lifetime": {sec: 0, nanosec: 0}, "frame_locked": False}
+    entities = [
+        {**entity, "id": "a", "metadata": [{"key": "speed", "value": "van"}, {"key": "Class", "value": "car"}]},
+        {**entity, "id": "b", "metadata": [{"key": "category", "value": "human.pedestrian.adult"}]},
+        {**entity, "id": "c", "metadata": []},
+    ]
+    for item, cubes in zip(entities, ([cube], [cube, {**cube, "size": xyz(0.5, 0.6, 1.8)}], []), strict=True):
+        item["cubes"] = cubes
+    return [
+        {"deletions": [], "entities": entities},
+        {"deletions": [{"timestamp": stamp, "type": 1, "id": "a"}], "entities": []},
+    ]
+
+
+def in_ros2() -> tuple[Definition, list[bytes]]:
+    text = text_of(
+        "Deletion[] deletions\nEntity[] entities",
+        p__Deletion="uint8 MATCHING_ID=0\nbuiltin_interfaces/Time timestamp\nuint8 type\nstring id",
+        p__Entity=(
+            "builtin_interfaces/Time timestamp\nstring frame_id\nstring id\nbuiltin_interfaces/Duration lifetime\n"
+            "bool frame_locked\nKeyValuePair[] metadata\nCube[] cubes"
+        ),
+        p__KeyValuePair="string key\nstring value",
+        p__Cube="geometry_msgs/Pose pose\ngeometry_msgs/Vector3 size\nstd_msgs/ColorRGBA color",
+    )
+    name = "foxglove_msgs/msg/SceneUpdate"
+    text = text.replace("MSG: p/", "MSG: foxglove_msgs/")
+    payloads = [serialised(text, m, name=name) for m in scene("sec", "nanosec")]
+    return CdrDefinition(name, "ros2msg", text.encode()), payloads
+
+
+def in_protobuf() -> tuple[Definition, list[bytes]]:
+    files: FileDescriptorSet = build_file_descriptor_set(SceneUpdate)
+    made = SimpleNamespace(id=1, name="foxglove.SceneUpdate", encoding="protobuf", data=files.SerializeToString())
+    payloads = []
+    for message in scene("seconds", "nanos"):
+        update = SceneUpdate()
+        for entity in message["entities"]:
+            said = update.entities.add()
+            ParseDict({k: v for k, v in entity.items() if k not in ("timestamp", "lifetime")}, said)
+            said.timestamp.FromNanoseconds(STAMP)
+        for deletion in message["deletions"]:
+            update.deletions.add(id=deletion["id"])
+        payloads.append(update.SerializeToString())
+    return ProtobufDefinition(made.name, made), payloads
+
+
+def in_json() -> tuple[Definition, list[bytes]]:
+    payloads = [json.dumps(m).encode() for m in scene("sec", "nsec")]
+    return JsonDefinition(payloads), payloads
+
+
+@pytest.mark.parametrize("encoded", [in_ros2, in_protobuf, in_json])
+def test_scene_updates(encoded: Any) -> None:
+    definition, payloads = encoded()
+    found = listed(definition, description(definition.offers()), payloads, np.array([5, 6]))
+    assert ids(found) == ["a", "b"]
+    assert classes(found) == ["car", "pedestrian"]
+    assert found.columns.rows.tolist() == [2, 0]
+    assert found.columns.stamp_ns.tolist() == [STAMP, 6]
+    assert found.columns.stamped.tolist() == [True, False]
+    assert [found.frames[k] for k in found.frame_code] == ["map"] * 2
+    assert values(found, "x_m") == [1, 1]
+    assert values(found, "yaw_rad") == [0.5, 0.5]
+    assert values(found, "length_m") == [4, 4]
+    assert values(found, "height_m") == [1.5, 1.5]
+    assert values(found, "vx_mps") == [None] * 2
+    assert found.columns.notes == ("1 cube beside a larger one of the same entity: left out", *GONE[encoded.__name__])
+
+
+def body(size: float, x: float = 0) -> dict[str, Any]:
+    return {"pose": {"position": xyz(x, 0, 0), "orientation": quaternion(0)}, "size": xyz(size, size, size)}
+
+
+def test_the_largest_cube_of_an_entity() -> None:
+    """Those behind it in the list, too; of equal ones the first; one without a size is smallest."""
+    cubes = [[body(1), body(3, 5), body(2)], [body(2, 6), body(2, 7)], [{**body(9), "size": {"x": 9}}, body(1, 8)]]
+    entities = [{"id": str(k), "cubes": of} for k, of in enumerate(cubes)]
+    definition = JsonDefinition(payloads := [json.dumps({"entities": entities}).encode()])
+    found = listed(definition, description(definition.offers()), payloads, np.array([5]))
+    assert ids(found) == ["0", "1", "2"]
+    assert values(found, "x_m") == [5, 6, 8]
+    assert found.columns.notes == ("4 cubes beside a larger one of the same entity: left out",)
+
+
+FORCE = "in force from earlier messages and not said again: not taken, a list holds what its message says"
+GONE = dict.fromkeys(["in_ros2", "in_json"], ("3 entities deleted",))
+GONE |= {"in_protobuf": (f"2 states {FORCE}", "1 entity deleted")}
+
+
+@pytest.mark.parametrize(
+    ("messages", "notes"),
+    [
+        (["a b", "a b", "a b"], ()),  # as most do
+        (["a b -", "a b -", "b a -"], ()),  # all deleted, and said anew
+        (["a b", "a", "a"], (f"2 states {FORCE}",)),
+        (["a", "b", "b", "a"], (f"3 states {FORCE}",)),  # a in two, b in the last
+        (["a b", "a -", "a -", "a b"], ("1 entity deleted",)),
+        (["a b", "-a b", "b"], ("1 entity deleted",)),
+        (["a b", "-a a b", "a b"], ()),  # deleted before it is said again
+        (["a b", "b", "-a b", "b"], (f"1 state {FORCE}", "1 entity deleted")),
+        (["a b", "-c a", "-b", ""], (f"3 states {FORCE}", "1 entity deleted")),
+        (["a/15 b", "b", "b", "b"], (f"1 state {FORCE}", "1 entity over their lifetime")),
+        (["a/15 b", "-a b", "b", "b"], ("1 entity deleted",)),
+        (["a/5 b", "a/5 b", "b"], ("1 entity over their lifetime",)),
+    ],
+)
+def test_entities_that_are_not_said_again(messages: list[str], notes: tuple[str, ...]) -> None:
+    """A second apart; `-`: all are deleted, `-a`: a is; `a/15`: with a lifetime of 1.5 s."""
+    said = []
+    for k, text in enumerate(messages):
+        at = {"sec": k, "nsec": 0}
+        entities, deletions = [], []
+        for word in text.split():
+            if word.startswith("-"):
+                deletions.append({"timestamp": at, "type": 1 if word == "-" else 0, "id": word[1:]})
+                continue
+            name, _, tenths = word.partition("/")
+            whole, tenth = divmod(int(tenths or 0), 10)
+            lifetime = {"sec": whole, "nsec": tenth * 10**8}
+            entities.append({"id": name, "timestamp": at, "lifetime": lifetime, "cubes": [body(1)]})
+        said.append(json.dumps({"deletions": deletions, "entities": entities}).encode())
+    definition = JsonDefinition(said)
+    logged = np.arange(len(said)) * 10**9
+    found = listed(definition, description(definition.offers()), said, logged)
+    assert found.columns.rows.tolist() == [sum(w[0] != "-" for w in text.split()) for text in messages]
+    assert found.columns.notes == notes
+
+
+def test_json_scenes_may_leave_out_much() -> None:
+    cube = {"pose": {"position": xyz(1, 2, 3), "orientation": quaternion(0)}, "size": xyz(4, 2, 1.5)}
+    payloads = [json.dumps({"entities": [{"cubes": [cube]}]}).encode()]
+    definition = JsonDefinition(payloads)
+    found = listed(definition, description(definition.offers()), payloads, np.array([5]))
+    assert classes(found) == ["other"]
+    assert found.columns.stamp_ns.tolist() == [5]
+    assert found.frames == ()
+
+
+def test_what_is_known_by_name() -> None:
+    assert len(DESCRIPTIONS) == 9
+    assert SCHEMAS == ("foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate")

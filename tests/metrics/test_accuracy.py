@@ -1,0 +1,570 @@
+"""How far off lists are: every figure in a scene one can compute in the head, and all sums against plain loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from copem_replay.core.object_list import Entries, Lists
+from copem_replay.core.tracks import CLASSES
+from copem_replay.metrics.accuracy import metrics as accuracy_figures
+from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, total
+from copem_replay.metrics.gospa import gospa, ospa
+from copem_replay.metrics.matching import Matches, match
+from tests.helpers.at_once import assess
+from tests.helpers.reports import between, entry, lists_of, stretches
+from tests.helpers.reports import joined as one_list
+from tests.oracles.accuracy import Places, looks_of, one_run, permuted, plainly, reference_of, scene_of, truth_of
+
+EGO, CAR, OTHER_CAR = 0, 1, 2
+NOTHING = one_list()
+GATE_M = 3.0
+
+
+def classes(*names: str) -> Any:
+    return np.isin(CLASSES, names)
+
+
+def assessed(
+    *runs: Sequence[Entries], places: Places, looks: dict[int, tuple[float, float]],
+    times_s: Sequence[float] | None = None, of: Sequence[str] = ("car", "car", "car", "car"), since_s: float = 0.0,
+    velocity: dict[int, tuple[float, float]] | None = None, captures: tuple[Sequence[float], Places] | None = None,
+    ego: Sequence[tuple[float, float] | None] | None = None, measured: Sequence[str] = ("car",), **given: Any,
+) -> Accuracy:  # fmt: skip
+    """Lists at 0, 1, 2 … s around an ego at the origin; captures at the same instants; cut-off 3 m."""
+    K = len(runs[0])
+    times = np.array(range(K) if times_s is None else times_s, dtype=float)
+    at_ego = [(0.0, 0.0)] * K if ego is None else list(ego)
+    truth = {EGO: at_ego, **places}
+    world, scene, lists = truth_of(truth, times.tolist(), velocity), scene_of(*of), lists_of(runs)
+    at_capture = world if captures is None else truth_of(captures[1], captures[0])
+    found = match(lists, world, scene, gate_m=GATE_M)
+    return assess(
+        lists, found, times, world, at_capture, scene, looks_of(looks), np.full(len(looks), since_s),
+        reference_of(at_ego), classes(*measured), settings=Settings(**({"cutoff_m": 3.0} | given)),
+    )  # fmt: skip
+
+
+def figure(name: str, of: Accuracy) -> float | None:
+    return FIGURES[name](total([of]))
+
+
+def standing(x_m: float, y_m: float, count: int) -> list[tuple[float, float]]:
+    return [(x_m, y_m)] * count
+
+
+def test_position_error_and_bias_of_pairs() -> None:
+    lists = [entry(11, 0), NOTHING, entry(10, 2)]
+    of = assessed(lists, places={CAR: standing(10, 0, 3)}, looks={CAR: (0, 2)})
+    assert of.error_m.tolist() == [[1.0, pytest.approx(math.nan, nan_ok=True), 2.0]]
+    assert figure("position_rmse_m", of) == pytest.approx(math.sqrt(5 / 2))
+    assert figure("bias_east_m", of) == pytest.approx(0.5)
+    assert figure("bias_north_m", of) == pytest.approx(1.0)
+    sums = of.by_object[0, 0]
+    assert (sums["looked"], sums["missed"], sums["pairs"]) == (3, 1, 2)
+
+
+def test_latency_is_an_error_now_and_none_at_capture() -> None:
+    # The car drives at 2 m/s; each list shows it where it was half a second ago.
+    times = [1.0, 2.0, 3.0]
+    lists = [entry(2 * (t - 0.5), 20, captured_s=t - 0.5, vx_mps=2.0) for t in times]
+    captures = [0.5, 1.5, 2.5]
+    of = assessed(
+        lists, times_s=times, places={CAR: [(2 * t, 20) for t in times]}, velocity={CAR: (2, 0)}, looks={CAR: (0, 3)},
+        captures=(captures, {CAR: [(2 * t, 20) for t in captures]}),
+    )  # fmt: skip
+    assert figure("position_rmse_m", of) == pytest.approx(1.0)
+    assert figure("bias_east_m", of) == pytest.approx(-1.0)
+    assert figure("position_rmse_captured_m", of) == pytest.approx(0.0)
+    assert figure("age_s", of) == pytest.approx(0.5)
+    assert figure("velocity_rmse_mps", of) == pytest.approx(0.0)
+
+
+def test_captures_without_truth_do_not_count() -> None:
+    lists = [entry(10.5, captured_s=t) for t in (0.0, 0.5, 2.0 + 9e-7, 2.5)]
+    captures = ([0.0, 1.0, 2.0], {CAR: [(10.0, 0.0), (10.0, 0.0), (11.5, 0.0)]})
+    of = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)}, captures=captures)
+    assert of.by_object[0, 0]["pairs_captured"] == 2
+    assert figure("position_rmse_captured_m", of) == pytest.approx(math.sqrt((0.5**2 + 1.0**2) / 2))
+    gone = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)}, captures=([0.0], {}))
+    assert figure("position_rmse_captured_m", gone) is None
+
+
+def test_velocity_error_is_the_length_of_the_difference() -> None:
+    lists = [entry(10, vx_mps=8.0, vy_mps=4.0), entry(10, vx_mps=5.0, vy_mps=0.0)]
+    of = assessed(lists, places={CAR: standing(10, 0, 2)}, velocity={CAR: (5, 0)}, looks={CAR: (0, 1)})
+    assert figure("velocity_rmse_mps", of) == pytest.approx(math.sqrt(25 / 2))
+
+
+def test_pairs_count_before_the_onset_but_nothing_is_looked_at_then() -> None:
+    lists = [entry(11), entry(11), entry(11), NOTHING]
+    of = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (2, 3)}, since_s=1.0)
+    sums = of.by_object[0, 0]
+    assert (of.first_list.tolist(), of.count.tolist()) == ([1], [3])
+    assert (sums["pairs"], sums["looked"], sums["missed"]) == (2, 2, 1)
+    np.testing.assert_array_equal(of.error_m, [[1, 1, np.nan]])
+    np.testing.assert_array_equal(of.gospa, [[np.nan, 1, 4.5]])
+
+
+def test_nothing_counts_while_there_is_no_ego_nor_while_the_object_is_missing_nor_after_the_end() -> None:
+    lists = [entry(11)] * 5
+    ego = [(0.0, 0.0), None, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)]
+    of = assessed(lists, places={CAR: [(10, 0), (10, 0), None, (10, 0), (10, 0)]}, looks={CAR: (0, 3)}, ego=ego)
+    np.testing.assert_array_equal(of.error_m, [[1, np.nan, np.nan, 1]])
+    assert of.by_object[0, 0]["looked"] == 2
+    assert of.by_run[0]["lists"] == 4
+    assert of.by_run[0]["ghosts"] == 1  # where the car is missing from the truth
+
+
+@pytest.mark.parametrize(
+    ("cov", "error", "expected"),
+    [
+        ((4.0, 0.0, 1.0), (2.0, 1.0), 2.0),
+        ((2.0, 1.0, 2.0), (1.0, 1.0), 2 / 3),  # eigenvalue 3 along the error
+        ((2.0, 1.0, 2.0), (1.0, -1.0), 2.0),  # eigenvalue 1
+        ((0.0, 0.0, 0.0), (3e-5, 0.0), 0.9),  # variances of 1e-9 at least
+        ((1.0, 1.0, 1.0), (1.0, 1.0), 1.0),  # singular: 2 along the diagonal
+    ],
+)
+def test_nees(cov: tuple[float, float, float], error: tuple[float, float], expected: float) -> None:
+    of = assessed([entry(10 + error[0], error[1], cov=cov)], places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    assert figure("nees", of) == pytest.approx(expected, rel=1e-6)
+
+
+def test_nees_band_is_of_as_many_samples_as_rows_with_a_match() -> None:
+    def of_rows(n: int) -> Accuracy:
+        matched, missed = [entry(10), entry(10)], [NOTHING, NOTHING]
+        return assessed(*[matched] * n, missed, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
+
+    hundred, more = of_rows(100), of_rows(500)
+    band = [figure("nees_low", hundred), figure("nees_high", hundred)]
+    assert band == pytest.approx([1.627, 2.411], abs=5e-4)
+    assert [figure("nees_low", more), figure("nees_high", more)] == pytest.approx([1.829, 2.179], abs=5e-4)
+
+
+def test_identity_switches_are_changes_of_the_track_last_named() -> None:
+    tracks = [5, 5, -1, 7, 7, 5]
+    lists = [entry(10, track_id=track) for track in tracks]
+    none = [entry(10)] * 6
+    of = assessed(lists, none, [NOTHING] * 6, places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})
+    assert of.by_object["switches"].tolist() == [[2], [0], [0]]
+    assert of.by_object["tracked"].tolist() == [[5], [0], [0]]
+    assert figure("identity_switches", of) == pytest.approx(2.0)  # of the one run that names tracks
+    assert figure("identity_switches", assessed(none, places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})) is None
+
+
+def test_duplicates_of_measured_objects() -> None:
+    both = one_list(entry(10, existence=0.9), entry(10.1, existence=0.8), entry(40), entry(40.1))
+    places = {CAR: standing(10, 0, 4), OTHER_CAR: standing(40, 0, 4)}  # the other one is not measured
+    of = assessed([both] * 4, places=places, looks={CAR: (2, 3)})
+    assert of.by_object[0, 0]["duplicates"] == 2  # in the lists looked at
+    assert of.by_run[0]["duplicates"] == 4  # in all
+    assert figure("duplicates_per_min", of) == pytest.approx(60.0)
+    assert figure("ghosts_per_min", of) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("held", "look", "longest_s"),
+    [
+        ("11111", (0, 4), 0.0),
+        ("00000", (0, 4), 4.0),
+        ("00110", (0, 4), 2.0),
+        ("10001", (0, 4), 3.0),  # unknown from the list at 1 s to the one at 4 s
+        ("10000", (0, 4.5), 3.5),
+        ("10000", (0.5, 4), 3.0),  # known before the onset, till the list at 1 s
+        ("01000", (0.5, 4), 2.0),
+        ("00001", (1.5, 4), 2.5),
+        ("10001", (1.5, 4), 2.5),  # known and lost again before the onset
+        ("1.101", (0, 4), 1.0),  # a list that says nothing about it changes nothing
+        ("1.001", (0, 4), 2.0),
+    ],
+)
+def test_longest_time_unknown(held: str, look: tuple[float, float], longest_s: float) -> None:
+    lists = [entry(10) if h == "1" else NOTHING for h in held]
+    ego = [None if h == "." else (0.0, 0.0) for h in held]
+    of = assessed(lists, places={CAR: standing(10, 0, 5)}, looks={CAR: look}, ego=ego)
+    assert of.by_object[0, 0]["mtl_s"] == pytest.approx(longest_s)
+    assert figure("mtl_s", of) == pytest.approx(longest_s)
+
+
+def test_before_the_first_list_it_is_unknown() -> None:
+    of = assessed([entry(10)] * 2, times_s=[2.0, 3.0], places={CAR: standing(10, 0, 2)}, looks={CAR: (0.5, 3)})
+    assert of.by_object[0, 0]["mtl_s"] == pytest.approx(1.5)
+    # Nor is a list from before its stay one of them.
+    of = assessed([entry(10), NOTHING], places={CAR: standing(10, 0, 2)}, looks={CAR: (1, 1.5)}, since_s=1.0)
+    assert of.by_object[0, 0]["mtl_s"] == pytest.approx(0.5)
+
+
+def test_never_matched() -> None:
+    of = assessed([NOTHING] * 3, places={CAR: standing(10, 0, 3)}, looks={CAR: (0, 2)})
+    for name in ("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps", "age_s", "nees",
+                 "nees_low", "nees_high", "identity_switches", "existence_error"):  # fmt: skip
+        assert figure(name, of) is None, name
+    assert figure("mtl_s", of) == pytest.approx(2.0)
+    assert figure("gospa_m", of) == figure("gospa_missed_m", of) == pytest.approx(math.sqrt(9 / 2))
+    assert figure("ospa_m", of) == pytest.approx(3.0)
+    assert of.by_object[0, 0]["missed"] == of.by_object[0, 0]["looked"] == 3
+
+
+def test_ghosts_are_of_measured_classes_and_of_no_object_at_all() -> None:
+    entries = one_list(
+        entry(0.2), entry(30, 1), entry(10), entry(60), entry(12, 8, existence=0.4), entry(70, of="pedestrian")
+    )
+    places = {CAR: standing(10, 0, 3), OTHER_CAR: standing(20, 0, 3), 3: standing(30, 0, 3)}
+    of = assessed(
+        [entries, NOTHING, entries], places=places, looks={CAR: (0, 2), OTHER_CAR: (1, 2)},
+        existence_thresholds=(0.0, 0.4, 0.5, 1.0),
+    )  # fmt: skip
+    # At the ego and at a neighbour nobody measures: no ghosts. The one at 60 m and the one beside the car are.
+    assert of.by_run[0]["ghosts"] == 4
+    assert of.ghosts_at.tolist() == [[4, 4, 2, 2]]
+    assert of.by_object["ghosts"].tolist() == [[3, 1]]  # at 0 s the other car is not yet looked at
+    assert figure("ghosts_per_min", of) == pytest.approx(80.0)  # 4 in 3 lists at 1 Hz
+
+
+def test_a_ghost_halfway_goes_to_the_first() -> None:
+    places = {OTHER_CAR: [(30.0, 0.0)], CAR: [(20.0, 0.0)]}
+    of = assessed([entry(25)], places=places, looks={CAR: (0, 0), OTHER_CAR: (0, 0)})
+    assert of.by_object["ghosts"].tolist() == [[1, 0]]
+    assert of.gospa.tolist() == [[9.0, 4.5]]
+
+
+def test_where_nothing_is_looked_at_there_is_neither_gospa_nor_ospa_and_ghosts_are_nobodys() -> None:
+    of = assessed([entry(50)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (1, 1)})
+    assert (of.by_run[0]["lists"], of.by_run[0]["lists_looked"]) == (2, 1)
+    assert of.by_run[0]["ghosts"] == 2
+    assert of.by_object["ghosts"].tolist() == [[1]]
+    assert of.by_object[0, 0]["gospa_false"] == pytest.approx(4.5)
+    # Of the list at 1 s alone: one object missed, one false entry.
+    assert figure("gospa_false_m", of) == pytest.approx(math.sqrt(4.5))
+    assert figure("gospa_missed_m", of) == pytest.approx(math.sqrt(4.5))
+    assert figure("gospa_m", of) == pytest.approx(3.0)
+    assert figure("ospa_m", of) == pytest.approx(3.0)
+    # An object that is missing from the truth is not looked at then.
+    gone = assessed([entry(50)] * 3, places={CAR: [(10, 0), None, (10, 0)]}, looks={CAR: (0, 2)})
+    assert gone.by_run[0]["lists_looked"] == 2
+    assert figure("gospa_m", gone) == pytest.approx(3.0)
+
+
+def test_gospa_and_ospa_of_the_worked_example() -> None:
+    # Truth at 0, 10 and 20 m, believed 1 m beside, 0.5 m ahead, and at 40 m.
+    shown = one_list(entry(0, 1), entry(10.5), entry(40))
+    places = {1: [(0, 0)], 2: [(10, 0)], 3: [(20, 0)]}
+    of = assessed([shown], places=places, looks=dict.fromkeys(places, (0, 0)), ego=[(-50, 0)], cutoff_m=5.0)
+    assert figure("gospa_m", of) == pytest.approx(5.123475, abs=1e-6)
+    assert figure("ospa_m", of) == pytest.approx(2.958040, abs=1e-6)
+    assert figure("gospa_localisation_m", of) == pytest.approx(math.sqrt(1.25))
+    assert figure("gospa_missed_m", of) == figure("gospa_false_m", of) == pytest.approx(math.sqrt(12.5))
+    assert of.gospa.tolist() == [[1.0, 0.25, 25.0]]
+    first_power = assessed(
+        [shown], places=places, looks=dict.fromkeys(places, (0, 0)), ego=[(-50, 0)], cutoff_m=5.0, power=1.0
+    )
+    assert first_power.gospa.tolist() == [[1.0, 0.5, 5.0]]
+    assert figure("gospa_m", first_power) == pytest.approx(6.5)
+    assert figure("ospa_m", first_power) == pytest.approx(6.5 / 3)
+
+
+def test_gospa_takes_the_best_pairs_though_the_match_is_another() -> None:
+    lists = [one_list(entry(10, existence=0.5), entry(11, existence=0.9))]
+    of = assessed(lists, places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    assert of.error_m.tolist() == [[1.0]]
+    assert of.gospa.tolist() == [[4.5]]  # no distance, one false entry
+
+
+def test_gospa_leaves_out_what_is_at_objects_not_looked_at() -> None:
+    entries = one_list(entry(0.1), entry(10), entry(20), entry(20.5), entry(30))
+    places = {CAR: standing(10, 0, 2), OTHER_CAR: standing(20, 0, 2), 3: standing(30, 0, 2)}
+    of = assessed([entries] * 2, places=places, looks={CAR: (0, 1), OTHER_CAR: (1, 1)})
+    np.testing.assert_array_equal(of.gospa, [[0, 0, np.nan, 4.5]])
+    assert figure("gospa_m", of) == figure("gospa_false_m", of) == pytest.approx(math.sqrt(4.5 / 2))
+    assert figure("ospa_m", of) == pytest.approx((0 + math.sqrt(9 / 3)) / 2)  # at 1 s two objects and three entries
+
+
+def test_an_unclassified_entry_at_what_is_looked_at_is_believed_but_no_ghost() -> None:
+    entries = one_list(entry(10, of="other"), entry(50, of="other"))
+    of = assessed([entries], places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    assert of.gospa.tolist() == [[0.0]]
+    assert of.by_run[0]["ghosts"] == 0
+    assert of.by_existence["entries"].sum() == 0
+
+
+def test_expected_calibration_error() -> None:
+    # Of four entries at 0.85 three are of the car, of two at 0.25 none; ten bins of equal width.
+    high, low = [entry(10, existence=0.85)] * 3 + [entry(50, existence=0.85)], [entry(60, existence=0.25)] * 2
+    of = assessed([*high, *low], places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})
+    assert figure("existence_error", of) == pytest.approx((4 * 0.10 + 2 * 0.25) / 6)
+    assert of.by_existence["entries"].tolist() == [[0, 0, 2, 0, 0, 0, 0, 0, 4, 0]]
+    assert of.by_existence["with_object"][0, 8] == 3
+    ends = assessed([entry(10, existence=1.0), entry(10, existence=0.0)], places={CAR: standing(10, 0, 2)}, looks={})
+    assert ends.by_existence["entries"].tolist() == [[1, 0, 0, 0, 0, 0, 0, 0, 0, 1]]
+    assert figure("existence_error", ends) == pytest.approx(0.5)
+
+
+def test_claims_that_are_too_high_do_not_make_up_for_those_that_are_too_low() -> None:
+    # Two entries at 0.25 are of the car, two at 0.75 of nothing: off by 0.75 each way.
+    of = assessed(
+        [entry(10, existence=0.25)] * 2 + [entry(50, existence=0.75)] * 2,
+        places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)},
+    )  # fmt: skip
+    assert figure("existence_error", of) == pytest.approx(0.75)
+
+
+def test_bands_of_distance_and_time() -> None:
+    # The car is 10, 20, 30 and 40 m away; the list at 2 s misses it, one ghost is 15 m away at 3 s.
+    lists = [entry(11), entry(20, 2), NOTHING, one_list(entry(40), entry(0, 15))]
+    of = assessed(
+        lists, places={CAR: [(10, 0), (20, 0), (30, 0), (40, 0)]}, looks={CAR: (1, 3)},
+        distance_edges_m=(0.0, 20.0, 40.0), time_edges_s=(1.0, 3.0, 9.0),
+    )  # fmt: skip
+    near, middle = of.by_distance[0]
+    assert (near["pairs"], near["looked"], near["missed"], near["ghosts"]) == (1, 0, 0, 1)
+    assert (middle["pairs"], middle["looked"], middle["missed"], middle["ghosts"]) == (1, 2, 1, 0)
+    assert (near["east_m"], near["square_m2"], near["nees"]) == (1.0, 1.0, 1.0)
+    assert (middle["north_m"], middle["square_m2"]) == (2.0, 4.0)
+    early, late = of.by_time[0]
+    assert (early["pairs"], early["looked"], early["missed"], early["ghosts"]) == (1, 2, 1, 0)
+    assert (late["pairs"], late["looked"], late["missed"], late["ghosts"]) == (1, 1, 0, 1)
+
+
+def test_no_looks_no_lists() -> None:
+    of = assessed([entry(50), entry(0)], [NOTHING, NOTHING], places={}, looks={})
+    assert of.by_object.shape == (2, 0)
+    assert of.error_m.shape == (2, 0)
+    assert of.by_run["ghosts"].tolist() == [1, 0]
+    assert figure("ghosts_per_min", of) == pytest.approx(15.0)  # 1 in 2 runs of 2 lists at 1 Hz
+    assert all(figure(name, of) is None for name in ("gospa_m", "gospa_false_m", "ospa_m", "mtl_s"))
+    of = assessed([], [], places={CAR: []}, looks={CAR: (1, 3)})
+    assert of.error_m.shape == of.gospa.shape == (2, 0)
+    assert of.by_object["mtl_s"].tolist() == [[2.0], [2.0]]
+    assert all(figure(name, of) is None for name in FIGURES if name != "mtl_s")
+
+
+def test_time_of_irregular_lists_and_of_one() -> None:
+    of = assessed([entry(50)] * 4, times_s=[0, 1, 3, 4], ego=[(0, 0), (0, 0), None, (0, 0)], places={}, looks={})
+    assert of.by_run[0]["time_s"] == pytest.approx(3.0)  # three lists, the only neighbours 1 s apart
+    assert figure("ghosts_per_min", assessed([entry(50)], places={}, looks={})) is None
+
+
+def test_totals_of_logs_add() -> None:
+    first = assessed([entry(11)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
+    other = assessed([entry(12)], [NOTHING], places={CAR: [(10, 0)], OTHER_CAR: [(20, 0)]}, looks={CAR: (0, 0), 2: (0, 0)})  # fmt: skip # noqa: E501
+    both = total([first]) + total([other])
+    assert accuracy_figures.position_rmse_m(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
+    assert (both.rows, both.matched_rows) == (5, 2)
+    assert accuracy_figures.gospa_m(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
+    with pytest.raises(ValueError, match="same settings"):
+        total([first]) + total([assessed([entry(1)], places={}, looks={}, cutoff_m=4.0)])
+
+
+def test_one_run_that_stands_for_all_counts_as_often_as_there_are_runs() -> None:
+    lists = [one_list(entry(11, existence=0.7), entry(50)), NOTHING]
+    given: dict[str, Any] = {
+        "places": {CAR: standing(10, 0, 2)}, "looks": {CAR: (0, 1)}, "distance_edges_m": (0.0, 60.0),
+        "time_edges_s": (0.0, 2.0), "existence_thresholds": (0.5,),
+    }  # fmt: skip
+    one, three = assessed(lists, **given), assessed(lists, lists, lists, **given)
+    assert_same(for_runs(one, 3), three)
+    assert_equal_totals(total([for_runs(one, 3)]), total([three]))
+    assert for_runs(three, 3) is three
+
+
+class Scenery:
+    """A few objects that come and go, and lists of what may be they, drawn from a seed."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        S, K, N = int(rng.integers(1, 4)), int(rng.integers(0, 7)), int(rng.integers(1, 7))
+        self.times = np.cumsum(rng.uniform(0.05, 0.5, K))
+        self.captures = np.cumsum(rng.uniform(0.05, 0.5, 8)).tolist()
+        home, self.velocity = rng.uniform(-6, 6, (N, 2)), {o: tuple(rng.normal(0, 2, 2)) for o in range(N)}
+
+        def way(o: int, times: Sequence[float]) -> list[tuple[float, float] | None]:
+            places = [tuple(home[o] + np.array(self.velocity[o]) * t) for t in times]
+            return [place if rng.uniform() < 0.85 else None for place in places]
+
+        self.places = {o: way(o, self.times.tolist()) for o in rng.permutation(N).tolist()}
+        self.places_captured = {o: way(o, self.captures) for o in range(N)}
+        self.scene = scene_of(*rng.choice(["car", "pedestrian", "truck"], N))
+        watched = sorted(rng.permutation(np.arange(1, N))[: rng.integers(0, N)].tolist())
+        onset = rng.uniform(0, 1.5, len(watched))
+        span = rng.uniform(0, 2.5, len(watched))
+        self.looks = looks_of({o: (a, a + d) for o, a, d in zip(watched, onset, span, strict=True)})
+        self.since_s = onset - rng.choice([0.0, 0.3, -0.1], len(watched))
+        self.reference = reference_of([None if rng.uniform() < 0.15 else tuple(rng.normal(0, 1, 2)) for _ in range(K)])
+        self.measured = classes(*rng.choice(CLASSES, 8))
+        self.lists = lists_of([[self._list(rng, k, way) for k in range(K)] for _ in range(S)])
+        self.world = truth_of(self.places, self.times.tolist(), self.velocity)
+        self.settings = Settings(
+            cutoff_m=2.5, power=float(rng.choice([1.0, 2.0, 3.0])), distance_edges_m=(0.0, 3.0, 6.0, np.inf),
+            time_edges_s=(0.2, 1.0, 1.5), existence_thresholds=(0.25, 0.5, 0.9),
+        )  # fmt: skip
+        self.found = match(self.lists, self.world, self.scene, gate_m=2.0)
+        self.rng = rng
+
+    def _list(self, rng: np.random.Generator, k: int, way: Any) -> Entries:
+        found = [place for o in self.places if (place := self.places[o][k]) is not None and rng.uniform() < 0.8]
+        again = [place for place in found if rng.uniform() < 0.3]
+        ghosts = [tuple(rng.uniform(-8, 8, 2)) for _ in range(int(rng.integers(0, 3)))]
+        entries = []
+        for place in [*found, *again, *ghosts]:
+            x, y = np.array(place) + rng.normal(0, 0.6, 2)
+            root = rng.normal(0, 1, (2, 2))
+            cov = root @ root.T
+            entries.append(
+                entry(
+                    x, y, of=str(rng.choice(["car", "pedestrian", "vehicle", "other"])), existence=rng.uniform(),
+                    cov=(cov[0, 0], cov[0, 1], cov[1, 1]), vx_mps=rng.normal(), vy_mps=rng.normal(),
+                    captured_s=rng.choice([*self.captures, 0.0]) + rng.choice([0.0, 8e-7, -8e-7]),
+                    track_id=rng.integers(-1, 3), unit_ix=rng.integers(-1, 3),
+                )
+            )  # fmt: skip
+        return one_list(*entries)
+
+    def of(self, lists: Lists, found: Matches) -> Accuracy:
+        at_capture = truth_of(self.places_captured, self.captures)
+        return assess(
+            lists, found, self.times, self.world, at_capture, self.scene, self.looks, self.since_s, self.reference,
+            self.measured, settings=self.settings,
+        )  # fmt: skip
+
+    def in_stretches(self, cuts: Sequence[float]) -> Accuracy:
+        """The same, fed with the lists between cuts, their instants, and the captures their entries name."""
+        adding = Assessment(
+            self.times, self.scene, self.looks, self.since_s, self.reference, self.measured, settings=self.settings,
+            runs=len(self.lists.start),
+        )  # fmt: skip
+        for a, b in stretches(cuts, len(self.times)):
+            lists, rows = between(self.lists, a, b)
+            named_s = lists.entries["captured_s"]
+            near = [f for f, t in enumerate(self.captures) if (abs(named_s - t) <= 2e-6).any()]
+            adding.add(
+                lists, Matches(self.found.object_ix[rows], self.found.role[rows]),
+                truth_of({o: way[a:b] for o, way in self.places.items()}, self.times[a:b].tolist(), self.velocity),
+                truth_of(
+                    {o: [way[f] for f in near] for o, way in self.places_captured.items()},
+                    [self.captures[f] for f in near],
+                ),
+            )  # fmt: skip
+        return adding.result()
+
+
+def assert_same(found: Accuracy, expected: Accuracy, *, exactly: bool = True) -> None:
+    for column in (f.name for f in fields(Accuracy) if f.name != "settings"):
+        got, want = getattr(found, column), getattr(expected, column)
+        assert got.shape == want.shape, column
+        for name in got.dtype.names or (None,):
+            a, b = (got, want) if name is None else (got[name], want[name])
+            if exactly:
+                np.testing.assert_array_equal(a, b, err_msg=f"{column} {name}")
+            else:
+                np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9, err_msg=f"{column} {name}")
+
+
+def assert_equal_totals(found: Total, expected: Total) -> None:
+    for column in (f.name for f in fields(Total) if f.name != "settings"):
+        got, want = np.asarray(getattr(found, column)), np.asarray(getattr(expected, column))
+        assert (got.dtype, got.shape, got.tobytes()) == (want.dtype, want.shape, want.tobytes()), column
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1))
+def test_sums_as_the_sentences_have_them(seed: int) -> None:
+    made = Scenery(seed)
+    found = made.of(made.lists, made.found)
+    expected = plainly(
+        made.lists, made.found, made.times, made.places, made.velocity, made.captures, made.places_captured,
+        made.looks, made.since_s, made.reference, made.measured, made.settings,
+    )  # fmt: skip
+    assert_same(found, expected, exactly=False)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_matter(seed: int) -> None:
+    made = Scenery(seed)
+    whole = made.of(made.lists, made.found)
+    parts = []
+    for s in range(len(made.lists.start)):
+        lists, its = one_run(made.lists, s)
+        parts.append(made.of(lists, Matches(made.found.object_ix[its], made.found.role[its])))
+        assert_same(parts[s], whole.of_run(s))
+    assert_equal_totals(total(parts), total([whole]))
+    shuffled, _, _ = permuted(made.lists, None, made.rng)
+    assert_same(made.of(shuffled, match(shuffled, made.world, made.scene, gate_m=2.0)), whole, exactly=False)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.lists(st.floats(0, 1), max_size=6))
+def test_stretches_add_up_to_the_whole_to_the_last_bit(seed: int, cuts: list[float]) -> None:
+    made = Scenery(seed)
+    assert_same(made.in_stretches(cuts), made.of(made.lists, made.found))
+
+
+def test_what_is_known_and_as_which_track_goes_on_over_a_cut() -> None:
+    lists = [entry(10, track_id=5), NOTHING, NOTHING, entry(10, track_id=7)]
+    made = Scenery(0)
+    made.times, made.lists = np.arange(4.0), lists_of([lists])
+    made.places, made.velocity = {EGO: standing(0, 0, 4), CAR: standing(10, 0, 4)}, {}
+    made.scene, made.looks, made.since_s = scene_of("car", "car"), looks_of({CAR: (0, 3)}), np.zeros(1)
+    made.reference = reference_of(standing(0, 0, 4))
+    made.world = truth_of(made.places, made.times.tolist())
+    made.found = match(made.lists, made.world, made.scene, gate_m=2.0)
+    sums = made.in_stretches([0.5]).by_object[0, 0]
+    assert (sums["switches"], sums["mtl_s"]) == (1, 2.0)
+
+
+def test_lists_too_many_or_too_few_are_a_defect() -> None:
+    made = Scenery(1)
+    none = truth_of({}, [])
+    adding = Assessment(
+        np.arange(2.0), made.scene, made.looks, made.since_s, reference_of([None, None]), made.measured,
+        settings=made.settings, runs=1,
+    )  # fmt: skip
+    no_matches = Matches(np.empty(0, dtype=int), np.empty(0, dtype=np.int8))
+    with pytest.raises(ValueError, match="expected 2 lists, found 0"):
+        adding.result()
+    with pytest.raises(ValueError, match="expected lists of 1 runs, at most 2 of each; found 1 runs of 3"):
+        adding.add(lists_of([[NOTHING] * 3]), no_matches, none, none)
+    with pytest.raises(ValueError, match="found 2 runs of 1"):
+        adding.add(lists_of([[NOTHING]] * 2), no_matches, none, none)
+
+
+@pytest.mark.parametrize("cut", [1, 7, 199])
+def test_blocks_of_many_runs_are_summed_as_the_whole_to_the_last_bit(cut: int) -> None:
+    # Of so many numbers NumPy adds up pairs of pairs, and sums of sums would round otherwise.
+    rng = np.random.default_rng(3)
+    runs = [[entry(*(10 + rng.normal(0, 0.7, 2)), existence=rng.uniform()) for _ in range(2)] for _ in range(200)]
+    given: dict[str, Any] = {
+        "places": {CAR: standing(10, 10, 2)}, "looks": {CAR: (0, 1)}, "distance_edges_m": (0.0, 60.0),
+        "time_edges_s": (0.0, 2.0), "existence_thresholds": (0.5,),
+    }  # fmt: skip
+    whole = assessed(*runs, **given)
+    blocks = [assessed(*runs[s : s + cut], **given) for s in range(0, len(runs), cut)]
+    assert_equal_totals(total(blocks), total([whole]))
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1))
+def test_parts_of_objects_add_up_to_gospa(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, shown = rng.uniform(0, 12, (4, 2)), rng.uniform(0, 12, (int(rng.integers(0, 7)), 2))
+    of = assessed(
+        [one_list(*(entry(x, y) for x, y in shown))], places={o + 1: [tuple(truth[o])] for o in range(4)},
+        looks={o + 1: (0, 0) for o in range(4)}, of=["car"] * 5, ego=[(-50, 0)],
+    )  # fmt: skip
+    expected = gospa(truth, shown, cutoff_m=3.0, power=2.0)
+    assert figure("gospa_m", of) == pytest.approx(expected.value_m)
+    assert of.gospa.sum() == pytest.approx(expected.value_m**2, rel=1e-5)
+    assert figure("gospa_localisation_m", of) == pytest.approx(math.sqrt(expected.localisation))
+    assert figure("gospa_missed_m", of) == pytest.approx(math.sqrt(expected.missed))
+    assert figure("gospa_false_m", of) == pytest.approx(math.sqrt(expected.false))
+    assert figure("ospa_m", of) == pytest.approx(ospa(truth, shown, cutoff_m=3.0, power=2.0))

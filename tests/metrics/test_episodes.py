@@ -1,0 +1,97 @@
+"""From when to when an object is looked at, and how far away it is: at the boundaries, by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.detections_table import distances
+from copem_replay.metrics.episodes import ENDED_BY, looks
+from copem_replay.perception.visibility import NO_STATICS
+from tests.helpers import scenes
+from tests.helpers.scenes import Thing, driving, experiment, recording, standing
+
+
+def looked(log: Recording, **changes: object) -> dict[str, tuple[float, bool, float, str]]:
+    """Onset, whether it held from the first, end and why, of each object."""
+    found = looks(log.scene, log.truth, NO_STATICS, experiment(**changes))
+    return {
+        log.scene.object_ids[k]: (float(onset_s), bool(at_start), float(ended_s), ENDED_BY[why])
+        for k, onset_s, at_start, ended_s, why in zip(
+            found.object_ix, found.onset_s, found.onset_at_start, found.ended_s, found.ended_by, strict=True
+        )
+    }
+
+
+def test_who_leaves_with_the_ego_has_left() -> None:
+    """Both are gone after 3 s of 8: the object's own end, so that it is never detected, not censored."""
+    until: dict[str, object] = {"there": lambda t: t < 3.01}
+    things = [
+        Thing("ego", "car", standing(0, 0), **until),  # type: ignore[arg-type]
+        Thing("with", "car", standing(20, 0), **until),  # type: ignore[arg-type]
+        Thing("after", "car", standing(20, 9), there=lambda t: t < 3.11),
+        Thing("stays", "car", standing(20, -9)),
+    ]
+    found = looked(recording(things, until_s=8.0), measure={"onset": {"kind": "appears"}})
+    assert found == {
+        "with": (0.0, True, 3.0, "object_left"),
+        "after": (0.0, True, 3.0, "ego_left"),
+        "stays": (0.0, True, 3.0, "ego_left"),
+    }
+
+
+@pytest.mark.parametrize(("later_us", "ended_by"), [(1, "object_left"), (2, "ego_left")])
+def test_a_microsecond_is_the_same_frame(later_us: int, ended_by: str) -> None:
+    things = [
+        Thing("ego", "car", standing(0, 0), there=lambda t: t < 0.5e-6),
+        Thing("other", "car", standing(20, 0), there=lambda t: t < (later_us + 0.5) * 1e-6),
+    ]
+    found = looked(recording(things, until_s=9e-6, rate_hz=1e6), measure={"onset": {"kind": "appears"}})
+    assert found["other"][3] == ended_by
+
+
+def test_who_is_in_range_when_the_ego_comes_was_so_from_the_start() -> None:
+    """The ego is in the log from 1 s on. What holds at the first frame that both share held already."""
+    things = [
+        Thing("ego", "car", standing(0, 0), there=lambda t: t > 0.99),
+        Thing("near", "car", standing(20, 0)),
+        Thing("comes", "car", driving(100, 5, -10)),
+    ]
+    found = looked(recording(things, until_s=8.0), measure={"onset": {"kind": "in_range", "range_m": 80}})
+    assert found["near"] == (1.0, True, 8.0, "log_end")
+    assert found["comes"][:2] == (pytest.approx(2.1), False)  # 100 − 10 t, and 5 m beside: 79.2 m away at 2.1 s
+
+
+@pytest.mark.parametrize(("share", "expected_s"), [(1.0, 2.3), (0.5, 2.1)])
+def test_what_is_wholly_visible_reaches_a_share_of_one(share: float, expected_s: float) -> None:
+    """A walker, 0.5 m wide, comes to the left from behind a wall whose left end is 1 m left of the line, 9.95 m ahead.
+
+    His middle, 20 m ahead, is past it at 20 / 9.95 = 2.01 m, his right side, up to 20.25 m ahead, at 2.04 + 0.25 m.
+    """
+    onset = {"onset": {"kind": "line_of_sight", "visible_share": share}}
+    found = looked(scenes.behind_a_wall(), measure=onset, visibility="flat", pems={"sure": scenes.SEES_ALL})
+    assert found["walker"][:2] == (pytest.approx(expected_s), False)
+
+
+def without_a_size(distance_to: str) -> tuple[Recording, Experiment]:
+    log = scenes.oncoming_car()
+    pole = {"at": [10.0, 0.0], "height_m": 5.0, "ground_z_m": 0.0, "pem": "sure"}
+    units = {"ego": scenes.EGO_UNIT, "pole": pole}
+    plan = experiment(units=units, measure={"onset": {"kind": "appears"}, "distance_to": distance_to})
+    return replace(log, scene=replace(log.scene, ego_sized=False)), plan
+
+
+@pytest.mark.parametrize(("distance_to", "distance_m", "gap_m"), [("ego", 80.0, None), ("pole", 70.0, 68.0)])
+def test_the_gap_to_a_unit_is_known_where_the_ego_has_no_size(
+    distance_to: str, distance_m: float, gap_m: float | None
+) -> None:
+    """At 2 s the car is at 80 m, its front 2 m nearer; a unit is a point, an ego of unknown size has no gap."""
+    log, plan = without_a_size(distance_to)
+    other = np.array([log.scene.object_number["other"]])
+    distance, gap = distances(log.scene, log.truth, plan, other, np.array([2.0]))
+    assert distance.tolist() == [pytest.approx(distance_m)]
+    assert np.isnan(gap[0]) if gap_m is None else gap[0] == pytest.approx(gap_m)

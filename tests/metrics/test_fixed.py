@@ -1,0 +1,137 @@
+"""Where nothing is drawn all runs are the same, and an interval over them would be about nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from copem_replay.metrics.fixed import fixed_in
+from copem_replay.metrics.summary_text import summary_text
+from copem_replay.report.figures import curves_figure, load_results
+from copem_replay.report.html.page import page
+from copem_replay.report.html.study import load_study
+from copem_replay.results.compare import compare, comparison_text
+from tests.helpers.report_pages import ONE, Page, changed, replayed
+
+DRAWN_REACTION = ("{kind: constant, delay_s: 0.2}", "{kind: gamma, shape: 4.0, mean_s: 0.2}")
+TRUTH_LATE = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: truth, latency_s: 0.5}")
+"""A change: `hit` is the truth, half a second late."""
+
+
+def summary_of(folder: Path) -> pd.DataFrame:
+    return pd.read_csv(folder / "summary.csv").set_index("configuration")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One object, runs that react alike: to be read."""
+    return replayed(tmp_path_factory.mktemp("fixed"), changed(ONE, TRUTH_LATE))
+
+
+@pytest.fixture(scope="module")
+def reacting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, but that the driver's delay is drawn."""
+    return replayed(tmp_path_factory.mktemp("reacting"), changed(ONE, TRUTH_LATE, DRAWN_REACTION))
+
+
+def test_the_truth_has_no_interval_over_runs(made: Path) -> None:
+    rows = summary_of(made)
+    for name in ("interval", "pass_interval"):
+        assert rows[name].to_dict() == dict.fromkeys(["late", "half", "never"], "wilson") | dict.fromkeys(
+            ["GT", "hit"], "nothing drawn"
+        )
+    nothing = ["detected_share_low", "detected_share_high", "pass_share_low", "pass_share_high", "interval_over",
+               "pass_interval_over"]  # fmt: skip
+    assert rows.loc[["GT", "hit"], nothing].isna().all(axis=None)
+    # By kind of unit: a PEM that always detects is drawn, too. 6 of 6, Wilson: 6 / (6 + 1.96²).
+    assert rows.loc["late", "detected_share_low"] == pytest.approx(6 / (6 + 1.959964**2), abs=1e-6)
+
+
+def test_a_reaction_that_is_drawn_gives_the_truth_an_interval_of_what_passes(reacting: Path) -> None:
+    rows = summary_of(reacting)
+    assert (rows["pass_interval"] == "wilson").all()
+    assert rows.loc["GT", "interval"] == "nothing drawn"
+
+
+def test_the_table_says_which_have_none(made: Path) -> None:
+    lines = summary_text(summary_of(made).reset_index()).splitlines()
+    (gt,) = (line for line in lines[:6] if line.startswith("GT"))
+    assert gt.split()[3:5] == ["1", "–"]
+    said = "no 95 % of GT, hit: nothing drawn, every run is the same"
+    assert [line for line in lines if "95 %" in line][1:3] == ["95 %: Wilson interval over runs", said]
+    assert lines.count(said) == 2
+
+
+def test_differences_of_what_is_not_drawn_have_no_interval(made: Path) -> None:
+    table = compare([made], configurations=["hit", "late"], baseline="GT").table
+    hit = table[table["configuration"] == "hit"]
+    assert set(hit["metric"]) >= {"detected_share", "ttd_rmst_s", "pass_share", "gospa_m"}
+    assert (hit["interval"] == "nothing drawn").all()
+    assert hit[["low", "high", "interval_over"]].isna().all(axis=None)
+    assert hit.set_index("metric").loc["ttd_rmst_s", "difference"] == pytest.approx(0.5)
+    late = table[table["configuration"] == "late"].set_index("metric")
+    # A sure PEM is drawn by kind; that all its runs are alike is seen.
+    assert late.loc["ttd_rmst_s", "interval"] == "all clusters alike"
+    assert late.loc["detected_share", "interval"] == "exact"
+
+
+def test_what_passes_depends_on_a_drawn_reaction(reacting: Path) -> None:
+    table = compare([reacting], configurations=["hit"], baseline="GT").table.set_index("metric")
+    assert table.loc["ttd_rmst_s", "interval"] == "nothing drawn"
+    assert table.loc["pass_share", "interval"] in ("bootstrap", "exact")
+
+
+def test_why_there_is_none_is_said_once(made: Path) -> None:
+    comparison = compare([made], configurations=["hit"], baseline="GT")
+    text = comparison_text(comparison)
+    assert "+0.5 (nothing drawn)" in text
+    assert "(nothing drawn): every run is the same, so that an interval over runs would tell nothing" in text
+    assert "[95 %]" not in text
+    assert not any(note.startswith("no interval") for note in comparison.notes)
+
+
+def test_reports_and_figures_do_without(tmp_path: Path) -> None:
+    text = changed(ONE, TRUTH_LATE)
+    head, _, tail = text.partition("pems:")
+    tail = "\n".join(line for line in tail.splitlines() if not line.startswith(("  late", "  half: {u", "  never")))
+    folder = replayed(tmp_path, head + tail[tail.index("configurations:") :] + "\n")
+    found = Page(page(load_study(folder)))
+    assert any(line.startswith("How sure: there are no intervals, for every run is the same") for line in found.lines())
+    assert "detected_share, no 95 % of GT, hit: nothing drawn, every run is the same." in found.words
+    cell = found.tables["summary"]["GT"]["detected_share"]
+    assert (cell.text.strip(), cell.low, cell.high) == ("1", None, None)
+    assert "(nothing drawn)" in found.tables["regret"]["hit"]["ttd_rmst_s"].text
+    assert not curves_figure(load_results(folder)).axes[0].collections
+
+
+TRUTH, RSU, EGO = {"units": "truth"}, {"units": ["rsu"]}, {"units": ["ego", "rsu"]}
+UNITS = {"rsu": {"recorded": {"topic": "rsu"}, "pem": None}, "ego": {"pem": "p", "recorded": None}}
+
+
+@pytest.mark.parametrize(
+    ("experiment", "lists", "reaction"),
+    [
+        (
+            {"units": UNITS, "configurations": {"t": TRUTH, "r": RSU, "e": EGO, "a": {"units": "all"}}},
+            {"t", "r"},
+            False,
+        ),
+        ({"configurations": {"t": TRUTH, "r": RSU}}, {"t"}, False),
+        ({"braking": {"driver": {"reaction": {"kind": "constant", "delay_s": 1.0}}}}, set(), True),
+        ({"braking": {"driver": {"kind": "own"}}}, set(), True),
+        ({"braking": {"driver": {"reaction": {"kind": "lognormal"}}}}, set(), False),
+        ({"braking": None}, set(), False),
+        ({}, set(), False),
+        ({"units": 3, "configurations": [1], "braking": "x"}, set(), False),
+    ],
+)
+def test_what_is_fixed_goes_by_the_kind_of_units_and_of_the_reaction(
+    experiment: dict[str, Any], lists: set[str], reaction: bool
+) -> None:
+    found = fixed_in(experiment)
+    assert (found.lists, found.reaction) == (lists, reaction)
+    assert found.known("t") == ("t" in lists)
+    assert found.passes("t") == (reaction and "t" in lists)

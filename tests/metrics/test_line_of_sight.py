@@ -1,0 +1,99 @@
+"""When somebody had the object in sight: by hand, in a scene where a wall of a lorry hides it until it is gone.
+
+The ego (1) stands at the origin. A pedestrian (2) stands 20 m ahead, a lorry (3) 10 m ahead until 1.0 s, its last
+frame: from 1.1 s on nothing hides him. A mast beside sees him all the time. 10 Hz, 2 s.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import read
+from copem_replay.metrics.line_of_sight import in_sight_s
+from copem_replay.pipeline.run import run
+from tests.helpers.recordings import Obj, pedestrian, write_recording
+
+EXPERIMENT = {
+    "version": 1,
+    "logs": ["drive.mcap"],
+    "pems": {
+        "eyes": [{"detection": {"kind": "visible_share"}}],
+        "psychic": [{"detection": {"kind": "constant", "probability": 1.0}}],
+        "blind": [{"when": {"classes": ["animal"]}, "detection": {"kind": "constant", "probability": 1.0}}],
+    },
+    "units": {
+        "ego": {"on": "ego", "height_m": 1.8, "pem": "eyes"},
+        "guess": {"on": "ego", "height_m": 1.8, "pem": "psychic"},
+        "blind": {"at": [20.0, 20.0], "height_m": 5.0, "ground_z_m": 0.0, "pem": "blind"},
+    },
+    "configurations": {
+        "GT": {"units": "truth"},
+        "alone": {"units": ["ego"], "latency_s": 0.3},
+        "guess": {"units": ["guess"]},
+        "both": {"units": ["ego", "blind"]},
+    },
+    "measure": {"objects": {"classes": ["pedestrian"]}, "onset": {"kind": "at", "time_s": 0.5}},
+    "show": None,
+}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    lorry = Obj(id=3, x=10.0, length=2.0, width=12.0, height=4.0, z=2.0)
+    frames = [
+        (0.1 * k, [Obj(id=1, x=0.0), pedestrian(2, 20.0), *([lorry] if k <= 10 else [])]) for k in range(21)
+    ]  # fmt: skip
+    return write_recording(tmp_path_factory.mktemp("logs") / "drive.mcap", frames, host=1)
+
+
+def test_in_sight_is_when_the_first_list_shows_it_whatever_is_made_of_it(log: Path) -> None:
+    result = run(Experiment.model_validate(EXPERIMENT), [read(log, name="drive")])
+    rows = result.table.set_index("configuration")
+    found = {name: rows.loc[name, ["in_sight_s", "captured_s", "detection_s"]].tolist() for name in rows.index}
+    assert np.isnan(found["GT"][0]), "the truth needs no sight"
+    assert found["alone"] == pytest.approx([1.1, 1.1, 1.4]), "the latency does not change what is in sight"
+    assert found["guess"] == pytest.approx([1.1, 0.5, 0.5]), "listed while hidden"
+    assert found["both"] == pytest.approx([0.5, 1.1, 1.1]), "in sight of a unit that never lists it"
+
+
+def test_what_is_never_in_sight_is_null(log: Path) -> None:
+    measure = EXPERIMENT["measure"] | {"onset": {"kind": "at", "time_s": 0.0}}  # type: ignore[operator]
+    wall = [{"polygon_m": [[12.0, -9.0], [13.0, -9.0], [13.0, 9.0], [12.0, 9.0]], "height_m": 9.0, "ground_z_m": 0.0}]
+    chosen = Experiment.model_validate(EXPERIMENT | {"measure": measure, "obstacles": wall})
+    rows = run(chosen, [read(log, name="drive")]).table.set_index("configuration")
+    assert np.isnan(rows.loc["alone", "in_sight_s"])
+    assert rows.loc["both", "in_sight_s"] == 0.0
+
+
+def test_only_units_that_are_there_in_a_run_have_it_in_sight() -> None:
+    units = {name: {"at": [0.0, 0.0], "height_m": 1.0, "pem": "eyes"} for name in "abc"}
+    recorded = {"rsu": {"recorded": {"topic": "rsu"}}}
+    chosen = Experiment.model_validate(
+        EXPERIMENT
+        | {
+            "units": {"a": units["a"], **recorded, "b": units["b"], "c": units["c"]},
+            "configurations": {
+                "ab": {"units": ["a", "b"]},
+                "c": {"units": ["c"]},
+                "rsu": {"units": ["a", "rsu"]},
+                "GT": {"units": "truth"},
+            },
+        }
+    )
+    first_s = np.array([[3.0, 1.0], [2.0, np.inf], [np.inf, np.inf]])  # a, b, c; two looks
+    equipped = np.array([[True, True, True, True], [True, False, False, True], [False, True, True, True]])
+
+    def of(name: str, there: np.ndarray | None) -> list[list[float]]:
+        found = in_sight_s(first_s, chosen, chosen.configurations[name], there)
+        return [[float(v) for v in row] for row in found]
+
+    nan = pytest.approx(np.nan, nan_ok=True)
+    assert of("ab", None) == [[2.0, 1.0]]
+    assert of("ab", equipped) == [[2.0, 1.0], [3.0, 1.0], [2.0, nan]]
+    assert of("c", None) == [[nan, nan]]
+    assert of("rsu", None) == [[nan, nan]], "recorded units don't tell what they had in sight"
+    assert of("GT", equipped) == [[nan, nan]]

@@ -1,0 +1,258 @@
+"""Visible shares against the plainly written oracle, over random scenes and recordings, and in scenes done by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from copem_replay.core.tracks import Tracks
+from copem_replay.io.recording import read
+from copem_replay.perception.visibility import (
+    NO_STATICS,
+    Observers,
+    Statics,
+    box_corners,
+    hidden_by,
+    statics,
+    visible_shares,
+)
+from tests.oracles.visibility import flat_share, prism, random_observer, random_scene, rectangle, surface_share
+
+DATA = Path(__file__).parents[2].parent / "shared" / "data"
+ERROR = 0.01  # the most that any view may be off
+
+
+def one_list(boxes: Sequence[tuple[float, float, float, float, float, float, float]]) -> Tracks:
+    """A list of boxes: x, y, yaw, length, width, bottom, top."""
+    x, y, yaw, length, width, bottom, top = np.array(boxes, dtype=float).T
+    n = len(boxes)
+    return Tracks(
+        units=("truth",),
+        start=np.arange(n + 1),
+        unit_ix=np.zeros(n, dtype=int),
+        object_ix=np.arange(n),
+        frame_ix=np.zeros(n, dtype=int),
+        stamp_ns=np.zeros(1, dtype=np.int64),
+        captured_s=np.zeros(1),
+        frame_unit_ix=np.zeros(1, dtype=int),
+        arrives_s=np.zeros((1, 1)),
+        valid=np.ones((1, n), dtype=bool),
+        x_m=x[None],
+        y_m=y[None],
+        z_m=(bottom + top)[None] / 2,
+        yaw_rad=yaw[None],
+        vx_mps=np.zeros((1, n)),
+        vy_mps=np.zeros((1, n)),
+        length_m=length[None],
+        width_m=width[None],
+        height_m=(top - bottom)[None],
+    )
+
+
+def shares(
+    world: Tracks, observer: Sequence[float], static: Statics = NO_STATICS, *, flat: bool, carrier: int = -1
+) -> np.ndarray:
+    """(P,) shares from one place."""
+    return visible_shares(world, static, at(observer, carrier), flat=flat)[0]
+
+
+def at(observer: Sequence[float], carrier: int = -1) -> Observers:
+    """One unit at one place."""
+    place = np.array(observer, dtype=float).reshape(1, 1, 3)
+    return Observers(place, np.ones((1, 1), dtype=bool), np.array([carrier]))
+
+
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("height_m", [0.6, 1.8, 5.0])
+def test_random_scenes_agree_with_the_oracle(seed: int, height_m: float) -> None:
+    rng = np.random.default_rng([seed, int(height_m * 10)])
+    bodies = random_scene(rng, boxes=10 + seed % 12, radius_m=18.0 + seed)
+    observer = random_observer(rng, bodies, height_m)
+    boxes, walls = [b for b in bodies if not b["static"]], [b for b in bodies if b["static"]]
+    corners = [np.asarray(b["polygon"]) for b in boxes]
+    # A rectangle's corners say its pose; the oracle only ever sees the corners.
+    poses = [
+        (
+            *c.mean(axis=0),
+            np.arctan2(*(c[0] - c[1])[::-1]),
+            np.hypot(*(c[0] - c[1])),
+            np.hypot(*(c[1] - c[2])),
+            b["z0"],
+            b["z1"],
+        )
+        for b, c in zip(boxes, corners, strict=True)
+    ]
+    static = statics([b["polygon"] for b in walls], [b["z0"] for b in walls], [b["z1"] - b["z0"] for b in walls])
+    world = one_list(poses)
+    flat, surface = (shares(world, observer, static, flat=f) for f in (True, False))
+    for k in range(len(boxes)):
+        others = [b for b in bodies if b is not boxes[k]]
+        assert flat[k] == pytest.approx(flat_share(observer[:2], corners[k], [b["polygon"] for b in others]), abs=1e-6)
+        assert surface[k] == pytest.approx(
+            surface_share(observer, prism(boxes[k]), [prism(b) for b in others], azimuths=1500), abs=ERROR
+        )
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
+@pytest.mark.parametrize("name", ["nuscenes_scene0061", "av2_3b3570b4"])
+def test_a_recording_agrees_with_the_oracle(name: str) -> None:
+    recording = read(DATA / f"{name}.mcap", name=name)
+    truth, ego = recording.truth, recording.scene.ego_ix
+    corners, checked = box_corners(truth), 0
+    order, bounds = truth.by_frame
+    for frame in range(0, len(truth.stamp_ns), 40):
+        rows = order[bounds[frame] : bounds[frame + 1]]
+        mine = rows[truth.row_object_ix[rows] == ego][0]
+        place = (truth.x_m[0, mine], truth.y_m[0, mine], truth.z_m[0, mine] - truth.height_m[0, mine] / 2 + 1.8)
+        world = one_list([
+            (*(getattr(truth, c)[0, r] for c in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")),
+             truth.z_m[0, r] - truth.height_m[0, r] / 2, truth.z_m[0, r] + truth.height_m[0, r] / 2)
+            for r in rows
+        ])  # fmt: skip
+        carrier = int(np.flatnonzero(rows == mine)[0])
+        flat, surface = (shares(world, place, flat=f, carrier=carrier) for f in (True, False))
+        others = [r for r in rows if r != mine]
+        for k, r in enumerate(rows):
+            if r == mine or np.hypot(truth.x_m[0, r] - place[0], truth.y_m[0, r] - place[1]) > 60:
+                continue
+            bodies = [
+                (corners[o], truth.z_m[0, o] - truth.height_m[0, o] / 2, truth.z_m[0, o] + truth.height_m[0, o] / 2)
+                for o in others
+                if o != r
+            ]
+            target = (
+                corners[r],
+                world.z_m[0, k] - world.height_m[0, k] / 2,
+                world.z_m[0, k] + world.height_m[0, k] / 2,
+            )
+            assert flat[k] == pytest.approx(flat_share(place[:2], corners[r], [b[0] for b in bodies]), abs=ERROR)
+            assert surface[k] == pytest.approx(surface_share(place, target, bodies, azimuths=800), abs=ERROR)
+            checked += 1
+    assert checked > 100
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
+def test_highway_merge_gives_the_published_table() -> None:
+    """The worked example of omega-prime-visibility's README, on its own recording."""
+    recording = read(DATA / "highway_merge.mcap", name="highway_merge")
+    truth, scene = recording.truth, recording.scene
+    wall = statics([np.array([(-220, 10), (-120, 10), (-120, 0), (-220, 0)])], [0.0], [1.0])
+    ego = np.flatnonzero(truth.row_object_ix == scene.ego_ix)
+    place = np.stack([truth.x_m[0, ego], truth.y_m[0, ego], np.full(len(ego), 1.8)], axis=-1)[None]
+    there = np.ones((1, len(ego)), dtype=bool)
+    share = visible_shares(truth, wall, Observers(place, there, np.array([scene.ego_ix])), flat=True)[0]
+
+    def shares_at(frame: int) -> dict[str, float]:
+        rows = np.flatnonzero(truth.frame_ix == frame)
+        return {scene.object_ids[truth.row_object_ix[r]]: share[r] for r in rows}
+
+    for frame, expected in ((0, 0.42), (1, 0.525), (2, 0.63), (3, 0.74)):
+        assert shares_at(frame)["1"] == pytest.approx(expected, abs=0.0051)
+        assert [shares_at(frame)[k] for k in "2345"] == [0, 0, 0, 0]
+    assert [shares_at(432)[k] for k in "345"] == [1, 0, 0]
+
+
+def test_over_a_low_wall() -> None:
+    """Observer 1 m up, a wall 1 m high half way: of a box 2 m high the lower metre is hidden. 2 m up: nothing is."""
+    world = one_list([(10.5, 0, 0, 1, 1, 0, 2), (5, 0, 0, 0.01, 20, 0, 1)])
+    assert shares(world, (0, 0, 1), flat=False)[0] == pytest.approx(0.5, abs=1e-3)
+    assert shares(world, (0, 0, 2), flat=False)[0] == pytest.approx(1.0, abs=2e-3)
+    assert shares(world, (0, 0, 1), flat=True)[0] == 0
+
+
+def test_a_bridge_hides_from_above() -> None:
+    """Eyes on the ground at 0 m; a beam from 1 m up, 5 m away, hides what is above 2 m at 10 m: half of 4 m."""
+    world = one_list([(10.5, 0, 0, 1, 1, 0, 4), (5, 0, 0, 0.001, 20, 1, 9)])
+    assert shares(world, (0, 0, 0), flat=False)[0] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_carrier_neither_hides_nor_is_seen() -> None:
+    world = one_list([(0, 0, 0, 4, 2, 0, 3), (10, 0, 0, 1, 1, 0, 2)])
+    seen = shares(world, (-3, 0, 1), flat=False, carrier=0)  # behind its own carrier's box
+    assert np.isnan(seen[0])
+    assert seen[1] == 1
+    assert shares(world, (-3, 0, 1), flat=True)[1] == 0
+
+
+def test_inside_overlapping_and_touching() -> None:
+    target = (10, 0, 0, 2, 2, 0, 2)
+    assert shares(one_list([target]), (10.5, 0, 1), flat=False)[0] == 1, "inside the target sees all of it"
+    around = one_list([target, (0, 0, 0, 4, 4, 0, 3)])
+    assert shares(around, (0, 0, 1), flat=False)[0] == 1, "the body around the unit is ignored"
+    overlapping = one_list([target, (8.5, 0, 0, 2, 8, 0, 3)])
+    assert shares(overlapping, (0, 0, 1), flat=False)[0] == 1, "an overlapping body does not hide"
+    touching = one_list([target, (8, 0, 0, 2, 8, 0, 3)])
+    assert shares(touching, (0, 0, 1), flat=False)[0] == 0, "a touching one does"
+
+
+def test_obstacle_that_overlaps_with_one_corner_hides_nowhere() -> None:
+    """An L of two wings: one reaches into the target, so no wing hides it. Another target behind it is hidden."""
+    ell = np.array([(4, -6), (5, -6), (5, 4), (9.5, 4), (9.5, 5), (4, 5)], dtype=float)
+    world = one_list([(10, 4.5, 0, 2, 2, 0, 2), (10, 0, 0, 1, 1, 0, 2)])
+    seen = shares(world, (0, 0, 1), statics([ell], [0.0], [5.0]), flat=False)
+    assert seen.tolist() == [1, 0]
+
+
+@given(turn=st.floats(-np.pi, np.pi), scale=st.floats(0.5, 3), east=st.floats(-1e5, 1e5), seed=st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_turning_scaling_and_moving_the_world_changes_nothing(
+    turn: float, scale: float, east: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    n = 8
+    boxes = np.column_stack([
+        rng.uniform(-20, 20, (n, 2)), rng.uniform(-3, 3, n), rng.uniform(0.5, 6, n), rng.uniform(0.5, 3, n),
+        np.zeros(n), rng.uniform(1, 4, n),
+    ])  # fmt: skip
+    c, s = np.cos(turn), np.sin(turn)
+    moved = boxes * [scale, scale, 1, scale, scale, scale, scale]
+    moved[:, :2] = moved[:, :2] @ [[c, s], [-s, c]] + [east, 0]
+    moved[:, 2] += turn
+    place = np.array([30.0, 30.0, 1.7])
+    there = np.array([*(place[:2] * scale @ [[c, s], [-s, c]] + [east, 0]), place[2] * scale])
+    for flat in (True, False):
+        before, after = shares(one_list(boxes), place, flat=flat), shares(one_list(moved), there, flat=flat)
+        # Whether boxes overlap or only touch may turn on rounding; random boxes do neither by a hair.
+        np.testing.assert_allclose(after, before, atol=1e-5)
+
+
+def test_rectangle_and_box_corners_agree() -> None:
+    world = one_list([(3, 4, 0.7, 4, 2, 0, 1)])
+    ours, theirs = box_corners(world)[0], rectangle(3, 4, 4, 2, 0.7)
+    assert {tuple(np.round(c, 9)) for c in ours} == {tuple(np.round(c, 9)) for c in theirs}
+
+
+def test_who_hides_whom() -> None:
+    """Seen from 1 m: a truck hides the far box wholly, a low box in front of it half; a house hides another."""
+    world = one_list(
+        [
+            (30, 0, 0, 1, 1, 0, 2),  # hidden by both that follow, more by the truck
+            (10, 0, 0, 1, 20, 0, 1),
+            (20, 0, 0, 2, 20, 0, 4),
+            (0, 30, 0, 1, 1, 0, 2),  # behind the house
+            (-30, 0, 0, 1, 1, 0, 2),  # free
+        ]
+    )
+    house = statics([np.array([(-5, 10), (5, 10), (5, 12), (-5, 12)])], [0.0], [9.0])
+    assert hidden_by(world, house, at((0, 0, 1)), flat=False)[0].tolist() == [2, -1, 1, -2, -1]
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_wall_from_far_behind_to_the_front_hides_what_is_ahead(side: int) -> None:
+    """Half a metre beside the eyes, from 100 m behind to 10 m ahead, where it leaves 0.05 of slope to its side.
+
+    Of what is 20 m ahead, from 7 m on the other side to 3 m on its own, all is seen to where the wall begins. Its own
+    middle is behind, on the other side of the line that azimuths are counted from.
+    """
+    world = one_list([(20, -2 * side, 0, 0.001, 10, 0, 2), (-45, side, 0, 110, 1, 0, 9)])
+    seen, wall = shares(world, (0, 0, 1), flat=True)
+    free, hidden = math.atan(7 / 20) + math.atan(0.05), math.atan(3 / 20) - math.atan(0.05)
+    assert seen == pytest.approx(free / (free + hidden), abs=1e-3)
+    assert wall == 1
+    assert hidden_by(world, NO_STATICS, at((0, 0, 1)), flat=True)[0].tolist() == [1, -1]

@@ -1,0 +1,303 @@
+"""A log in stretches gives what it gives in one piece, to the last bit: tables, summary, MCAP, and what is said."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from copem_replay.cli import main as cli
+from copem_replay.core.object_list import Lists, Reports
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.fusion.base import ListFusion
+from copem_replay.fusion.union import Union
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline import chunking as stretches
+from copem_replay.pipeline.accuracy_tables import AccuracyTables
+from copem_replay.pipeline.chunking import WHOLE, Reach, Stretch
+from copem_replay.pipeline.log_replay import Beliefs, prepare
+from copem_replay.pipeline.receiver import listen, seen_by_all
+from copem_replay.pipeline.run import Result, run
+from tests.helpers import scenes
+from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.scenes import Thing, driving, experiment, standing
+from tests.io import test_recorded_units as test_recorded
+from tests.viewer.test_rrd import rows
+
+LOGS = Path(__file__).parents[2] / "logs"
+
+
+class AllAtOnce(ListFusion):
+    """A user's own fusion that says nothing of stretches."""
+
+    kind: str = "tests.pipeline.test_chunking:AllAtOnce"
+
+    def fuse(self, reports: Reports) -> Lists:
+        return Union().fuse(reports)
+
+
+def shown_in(path: Path) -> dict[str, list[str]]:
+    """By entity what a recording says of it at which instants, however it is cut into chunks."""
+    from rerun.chunk import RrdReader
+
+    entities = {chunk.entity_path for chunk in RrdReader(path).stream()}
+    return {entity: sorted(str(sorted(row.items())) for row in rows(path, entity)) for entity in entities}
+
+
+def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: int) -> tuple[Result, Result]:
+    """In one piece, and in stretches of so many candidate rows."""
+    whole = run(plan, recordings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stretches, "ROWS_AT_ONCE", 1)
+        patch.setattr(stretches, "ROWS_A_STRETCH", rows_at_once)
+        return whole, run(plan, recordings)
+
+
+def assert_same(whole: Result, pieces: Result) -> None:
+    assert [replay.stretches for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
+    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
+    pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
+    assert whole.notes == pieces.notes
+    assert (whole.sweep is None) == (pieces.sweep is None)
+    if whole.sweep is not None:
+        pd.testing.assert_frame_equal(whole.sweep, pieces.sweep, check_exact=True)
+    assert whole.accuracy is not None
+    assert pieces.accuracy is not None
+    assert_same_tables(whole.accuracy, pieces.accuracy)
+
+
+def assert_same_tables(whole: AccuracyTables, pieces: AccuracyTables) -> None:
+    pd.testing.assert_frame_equal(whole.bands, pieces.bands, check_exact=True)
+    for name in ("accuracy", "instants", "lists", "thresholds"):
+        mine, theirs = getattr(whole, name), getattr(pieces, name)
+        assert (mine is None) == (theirs is None)
+        assert mine is None or mine.equals(theirs), name
+
+
+@pytest.mark.parametrize(("name", "rows", "configurations"), [("tc016d", 1500, None), ("crossing", 25_000, 9)])
+def test_the_sample_logs(name: str, rows: int, configurations: int | None) -> None:
+    source = load(LOGS / f"{name}.yaml")
+    plan, found = problems(source)
+    assert plan is not None, found
+    chosen = dict(list(plan.configurations.items())[:configurations])
+    plan = plan.model_copy(update={"runs": 2, "configurations": chosen})
+    recordings, _ = read_logs(plan, log_paths(source)[0], source)
+    whole, pieces = both_ways(plan, recordings, rows)
+    assert len(pieces.replays[0].stretches) > 5
+    assert_same(whole, pieces)
+
+
+NOISY = [
+    {
+        "when": {"range_m": [0, 45]},
+        "detection": {"kind": "constant", "probability": 0.6},
+        "error": {"kind": "gaussian", "covariance_m2": [[0.5, 0.1], [0.1, 0.3]], "speed_sigma_mps": 0.3},
+    }
+]
+
+
+def traffic() -> Recording:
+    """The ego drives along a street; others come towards it, cross, stand, come and go, one with a gap of 0.3 s."""
+    things = [
+        Thing("ego", "car", driving(-30, 0, 6)),
+        Thing("oncoming", "car", driving(60, 3, -8), yaw_rad=math.pi),
+        Thing("crossing", "pedestrian", driving(10, -6, 0, 1.5), there=lambda t: 1 < t < 7),
+        Thing("blinking", "pedestrian", driving(5, 5, 0.5), there=lambda t: not 2.95 < t < 3.15 and t < 6),
+        Thing("parked", "truck", standing(20, -4)),
+        Thing("late", "car", driving(40, -20, 0, 5), there=lambda t: t > 5),
+    ]
+    return scenes.recording(things, until_s=9.0)
+
+
+@st.composite
+def plans(draw: st.DrawFn) -> Experiment:
+    """Units on the ego, on another and on a mast, some at rates of their own; late lists; any of the fusions."""
+    rates = st.sampled_from([None, 10.0, 7.0, 23.0])
+    late = st.sampled_from([0.0, 0.05, 0.1, 0.37, 1.4])
+    units: dict[str, Any] = {
+        "ego": {"on": "ego", "height_m": 1.8, "pem": "noisy", "rate_hz": draw(rates)},
+        "mast": {"at": [15.0, 8.0], "height_m": 5.0, "pem": "noisy", "rate_hz": 7.0, "phase_s": 0.03},
+        "car": {"on": draw(st.sampled_from(["oncoming", "late", "blinking"])), "height_m": 1.5, "pem": "noisy"},
+    }
+    if draw(st.booleans()):
+        units["fleet"] = {"on": {"classes": ["car"], "share": 0.5}, "pem": "noisy"}
+    configurations: dict[str, Any] = {"GT": {"units": "truth", "latency_s": draw(late)}, "PEM": {"units": ["ego"]}}
+    fusions: list[dict[str, Any]] = [
+        {"kind": "ideal"}, {"kind": "ideal", "combine": "posterior"}, {"kind": "union"}, {"kind": "nms"},
+        {"kind": "gnn"}, *({"kind": "tracker", "late": how} for how in ("stale", "predict", "replay")),
+    ]  # fmt: skip
+    for k, fusion in enumerate(draw(st.lists(st.sampled_from(fusions), min_size=1, max_size=3))):
+        delays = {"ego": draw(late), "mast": draw(late), "default": draw(late)}
+        configurations[str(k)] = {
+            "units": "all",
+            "fusion": fusion,
+            "latency_s": delays,
+            "max_age_s": draw(st.sampled_from([0.3, 1.0])),
+        }
+    measure: dict[str, Any] = {
+        "onset": draw(st.sampled_from([{"kind": "appears"}, {"kind": "in_range", "range_m": 40}])),
+        "count_earlier": draw(st.booleans()),
+        "confirm": draw(st.sampled_from([{"hits": 1, "of": 1}, {"hits": 2, "of": 3}])),
+        "match": {"gate_m": 3.0, "always": draw(st.booleans())},
+    }
+    if draw(st.booleans()):
+        measure["conflict"] = {"horizon_s": 3.0, "margin_m": 0.5}
+    return experiment(
+        runs=2, seed=draw(st.integers(0, 99)), pems={"noisy": NOISY}, units=units, configurations=configurations,
+        measure=measure,
+    )  # fmt: skip
+
+
+@given(plan=plans(), rows=st.integers(40, 700))
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_whatever_is_replayed(plan: Experiment, rows: int) -> None:
+    whole, pieces = both_ways(plan, [traffic()], rows)
+    assert len(pieces.replays[0].stretches) > 1
+    assert_same(whole, pieces)
+
+
+def test_recorded_units(tmp_path: Path) -> None:
+    """A unit whose lists come late, and once in the wrong order, beside fusions of all kinds."""
+    lists = [
+        test_recorded.list_of(stamp_s, test_recorded.car(29.5 + k / 10, 0.2))
+        for k, stamp_s in enumerate((0.2, 0.35, 0.5, 0.64, 0.6, 0.9, 1.1, 1.3, 1.65, 1.9))
+    ]
+    path = test_recorded.drive(tmp_path / "drive.mcap", *lists)
+    plan = test_recorded.plan_of(path, unit={"delay_s": 0.17})
+    whole, pieces = both_ways(plan, [test_recorded.read(path, unit={"delay_s": 0.17})], 10)
+    assert len(pieces.replays[0].stretches) > 3
+    assert_same(whole, pieces)
+
+
+def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() -> None:
+    plan = experiment(
+        runs=3, pems={"sure": NOISY}, configurations={"ideal": {"units": "all", "latency_s": 0.1}},
+        measure={
+            "onset": {"kind": "appears"}, "accuracy": False, "objects": {"classes": ["pedestrian"]},
+            "conflict": {"horizon_s": 3.0, "margin_m": 0.5},
+        },
+    )  # fmt: skip
+    whole, pieces = both_ways(plan, [traffic()], 60)
+    assert len(pieces.replays[0].stretches) > 5
+    assert whole.table["conflict_detection_s"].notna().any()
+    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
+    pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
+    for replay in (whole.replays[0], pieces.replays[0]):
+        worlds = list(replay.worlds(plan, None, measured_only=True))
+        assert {int(k) for world in worlds for k in world.found.tracks.row_object_ix} == pedestrians
+
+
+def test_sweeps() -> None:
+    plan = experiment(
+        pems={"sure": NOISY}, sweep={"latency_s": [0.0, 0.3], "rate_hz": [5.0]},
+        configurations={"GT": {"units": "truth"}, "ideal": {"units": "all", "latency_s": 0.1}},
+    )  # fmt: skip
+    assert_same(*both_ways(plan, [traffic()], 60))
+
+
+def test_a_fusion_that_is_not_resumable_gets_all_at_once() -> None:
+    own = {
+        "GT": {"units": "truth"},
+        "own": {"units": "all", "fusion": {"kind": "tests.pipeline.test_chunking:AllAtOnce"}},
+    }
+    plan = experiment(pems={"sure": NOISY}, configurations=own)
+    whole, pieces = both_ways(plan, [traffic()], 50)
+    assert pieces.replays[0].stretches == (WHOLE,)
+    assert_same(whole, pieces)
+
+
+def test_stretches_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stretches, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(stretches, "ROWS_A_STRETCH", 40)
+    log = traffic()
+    replay = prepare(log, experiment())
+    cuts = replay.stretches
+    assert (cuts[0].from_s, cuts[-1].until_s) == (-np.inf, np.inf)
+    assert all(one.until_s == after.from_s for one, after in pairwise(cuts))
+    rows = [len(replay.found(stretch).tracks.frame_ix) for stretch in cuts]
+    assert sum(rows) == len(replay.found(WHOLE).tracks.frame_ix)
+    assert max(rows) <= 40
+    alone = Beliefs(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
+    assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
+    monkeypatch.setattr("copem_replay.pipeline.log_replay.ROWS_HELD", 40)
+    with pytest.raises(Exception, match="too long to be held at once; take a window of it"):
+        Beliefs(replay, experiment(), 0).whole()
+
+
+def test_how_far_back_a_stretch_reaches() -> None:
+    """Lists captured every second arrive 0.4 s later; the receiver goes by each until the next; a tracker by 2 s."""
+    plan = experiment(configurations={"ideal": {"units": ["ego"], "latency_s": 0.4}})
+    log = scenes.recording([Thing("ego", "car", standing(0, 0))], until_s=10.0, rate_hz=1.0)
+    heard = log.truth.captured_between(np.inf, np.inf)  # what is in the lists does not matter
+    late = Recording(**{**vars(log), "truth": heard}).truth
+    late = type(late)(**{**{f: getattr(late, f) for f in late.__dataclass_fields__}, "arrives_s": late.arrives_s + 0.4})
+    reach = Reach(plan, {"ideal": late})
+    # From 5.2 s on: the first instant is 5.4 s, at which the list captured at 5 s arrives.
+    assert reach.earliest_s(Stretch(5.2, 8.0)) == pytest.approx(5.0, abs=0.01)
+    assert reach.earliest_s(Stretch(5.2, 5.3)) == 5.2  # no instant at all
+    assert reach.earliest_s(Stretch(4.8, 8.0)) == pytest.approx(4.8, abs=0.01)
+    assert reach.earliest_s(Stretch()) == -np.inf
+    tracker = {"kind": "tracker", "late": "replay", "buffer_s": 2.0}
+    replayed = experiment(configurations={"t": {"units": ["ego"], "latency_s": 0.4, "fusion": tracker}})
+    # At 5.0 s the newest that has arrived was captured at 4 s: 2 s before that.
+    assert Reach(replayed, {"t": late}).earliest_s(Stretch(5.0, 8.0)) == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_stretch_reaches_back_to_a_list_that_another_unit_still_goes_by() -> None:
+    """One unit's list of 2 s is the newest it has for a second: an instant of the other one at 2.9 s goes by it."""
+    plan = experiment(
+        units={"ego": scenes.EGO_UNIT, "slow": {"at": [0, 9], "height_m": 5.0, "pem": "sure", "rate_hz": 1.0}},
+        configurations={"ideal": {"units": "all", "latency_s": {"default": 0.2}}},
+    )
+    replay = prepare(traffic(), plan)
+    lists = replay.lists_only(plan)
+    seen = seen_by_all(lists, np.arange(1), states="true")
+    heard = {"ideal": listen(seen, lists.truth, lists.experiment, lists.experiment.configurations["ideal"])}
+    assert Reach(plan, heard).earliest_s(Stretch(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
+
+
+def test_the_results_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All its files but the .rrd are the same, and that one has the same entities with the same in them."""
+    frames = [
+        (0.1 * k, [Obj(id=1, x=1.0 * k), pedestrian(id=2, x=20.0, y=-3 + 0.1 * k), Obj(id=3, x=40.0 - k, y=4.0)])
+        for k in range(41)
+    ]
+    write_recording(tmp_path / "drive.mcap", frames, host=1)
+    (tmp_path / "plan.yaml").write_text(
+        "version: 1\nlogs: [drive.mcap]\nruns: 2\npems: {p: [{detection: {kind: constant, probability: 0.7}}]}\n"
+        "units: {ego: {on: ego, height_m: 1.8, pem: p}, mast: {at: [9, 9], height_m: 5, pem: p}}\n"
+        "configurations: {GT: {units: truth}, ideal: {units: all, latency_s: 0.2}, gnn: {units: all, fusion: "
+        "{kind: gnn}}, tracker: {units: all, fusion: {kind: tracker}}}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    for out, count in (("whole", 10**9), ("pieces", 60)):
+        with monkeypatch.context() as patch:
+            patch.setattr(stretches, "ROWS_AT_ONCE", count)
+            patch.setattr(stretches, "ROWS_A_STRETCH", count)
+            patch.setattr("sys.argv", ["copem-replay", "run", "plan.yaml", "--out", out])
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            assert ended.value.code == 0
+    assert "long" not in capsys.readouterr().err
+    files = {path.name for path in (tmp_path / "whole").iterdir()}
+    assert files == {path.name for path in (tmp_path / "pieces").iterdir()}
+    for name in files - {"replay.rrd"}:
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "pieces" / name).read_bytes(), name
+    whole, pieces = (shown_in(tmp_path / out / "replay.rrd") for out in ("whole", "pieces"))
+    assert {"/world/gnn/status", "/world/ideal/listings", "/lanes/2\\ pedestrian"} <= whole.keys()
+    why = [name for name in whole if name.endswith(("status", "hiding", "listings")) or name.startswith("/lanes")]
+    assert len(why) == 4 + 3 + 2  # of all configurations, of those with units, of both objects
+    assert {name: whole[name] for name in why} == {name: pieces[name] for name in why}
+    assert whole.keys() == pieces.keys()

@@ -1,0 +1,191 @@
+"""What is odd about a log and an experiment is said by `check` in the words of `run`, and before it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from copem_replay.core.errors import ExperimentError
+from copem_replay.experiment.file import log_paths
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline import memory
+from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.pipeline.run import notes_of, run
+from tests.helpers.experiments import TEXT, changed, drive, source_of
+from tests.helpers.recordings import Obj, write_recording
+
+MAST = "  mast: {{at: {at}, yaw_deg: {yaw}, height_m: 5.0, pem: onboard}}"
+
+
+def made(folder: Path, text: str) -> tuple[Experiment, list[Recording], list[Replay]]:
+    source = source_of(folder, text)
+    experiment, found = problems(source)
+    assert experiment is not None, found
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source)
+    assert (found, refused) == ([], [])
+    return experiment, recordings, [prepare(recording, experiment) for recording in recordings]
+
+
+def before(folder: Path, text: str) -> list[str]:
+    experiment, recordings, ready = made(folder, text)
+    return notes_of(recordings, ready, experiment, replayed=False)
+
+
+def after(folder: Path, text: str) -> list[str]:
+    experiment, recordings, _ = made(folder, text)
+    return [note for note in run(experiment, recordings).notes if not note.startswith("no interval")]
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    drive(tmp_path / "drive.mcap")
+    return tmp_path
+
+
+def couple(when: str) -> str:
+    return f"    - when: {when}"
+
+
+UNMET = "no object ever meets a condition of its PEM 'onboard'"
+BOTH = [f"drive: unit ego: {UNMET}", f"drive: unit mast: {UNMET}"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (TEXT.splitlines()[0], []),
+        ("  coPEM: {units: all, latency_s: 3.01}",
+         ["drive: configuration coPEM: the latency of ego, mast is longer than the log"]),
+        ("  coPEM: {units: all, latency_s: {mast: 4}}",
+         ["drive: configuration coPEM: the latency of mast is longer than the log"]),
+        ("measure: {onset: {kind: at, time_s: 99}}",
+         ["drive: no rows: the onset at 99 s lies after the log's end, 3 s"]),
+        ("measure: {objects: {classes: [truck]}}",
+         ["drive: no rows: nothing to measure (truck); the log has car, other beside the ego"]),
+        # From the ego the parked car is 30 m away at 90°, the other one 40 to 70 m at 0°.
+        (couple("{range_m: [0, 20]}"), BOTH[:1]),  # the mast, at (12, −4.5), has the ego 12.8 m away
+        (couple("{range_m: [0, 5]}"), BOTH),
+        (couple("{range_m: [71, 1000]}"), BOTH),
+        (couple("{azimuth_deg: [-170, -160]}"), BOTH),
+        (couple("{azimuth_deg: [-0.001, 0.001], range_m: [0, 39]}"), BOTH),  # degrees that were radians
+        (couple("{classes: [pedestrian]}"), BOTH),
+        (couple("{classes: [car]}"), []),
+        (MAST.format(at="[12.0, 5000.0]", yaw=0).replace("pem:", "ground_z_m: 0, pem:"),
+         ["drive: unit mast: its place [12, 5000] is 4.97 km away from all objects, which are within x 0 … 70 m, "
+          "y 0 … 30 m", f"drive: unit mast: {UNMET}"]),
+        (MAST.format(at="[500000.0, 0.0]", yaw=0),
+         ["drive: unit mast: no object within 50 m, ground taken as z = 0 (give ground_z_m)",
+          "drive: unit mast: its place [500000, 0] is 500 km away from all objects, which are within x 0 … 70 m, "
+          "y 0 … 30 m", f"drive: unit mast: {UNMET}"]),
+        (MAST.format(at="[1900.0, 0.0]", yaw=0).replace("pem:", "ground_z_m: 0, rate_hz: 5, pem:"),
+         [f"drive: unit mast: {UNMET}"]),
+    ],
+)  # fmt: skip
+def test_check_says_it_as_run_does(here: Path, change: str, said: list[str]) -> None:
+    assert before(here, changed(change)) == said
+    assert after(here, changed(change)) == said
+
+
+def test_what_only_a_replay_can_tell_is_said_by_run_alone(here: Path) -> None:
+    """Behind an obstacle nothing has a visible share: who hides whom is not looked at before."""
+    wall = "obstacles: [{polygon_m: [[3, -9], [4, -9], [4, 9], [3, 9]], height_m: 50}]"
+    text = changed(couple("{visible_share: [0.1, 1], azimuth_deg: [-45, 45]}"), "  mast: {on: 3, pem: onboard}", wall)
+    assert f"drive: unit ego: {UNMET}" not in before(here, text)
+    assert f"drive: unit ego: {UNMET}" in after(here, text)
+
+
+def fleet(folder: Path, *, far: int) -> str:
+    """An ego, three cars around it, and `far` cars a kilometre away and from each other."""
+    cars = [Obj(id=2 + k, x=10.0 * k, y=10.0) for k in range(3)]
+    cars += [Obj(id=10 + k, x=1000.0 * (k + 1), y=500.0) for k in range(far)]
+    write_recording(folder / "drive.mcap", [(k / 10, [Obj(id=1), *cars]) for k in range(5)], host=1)
+    return changed(
+        "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}", "measure: {onset: {kind: appears}}"
+    ).replace(", latency_s: 0.5", "")
+
+
+@pytest.mark.parametrize("rate", ["", ", rate_hz: 7"])
+def test_a_fleet_is_said_in_one_line(tmp_path: Path, rate: str) -> None:
+    text = fleet(tmp_path, far=17).replace("pem: onboard}\nconf", f"pem: onboard{rate}}}\nconf")
+    no_table = "no accuracy.parquet: units that only some runs have give each run its own instants"
+    expected = [f"drive: unit mast, on 17 of its 20 carriers: {UNMET}", no_table]
+    assert before(tmp_path, text) == expected
+    assert after(tmp_path, text) == expected
+
+
+def test_a_fleet_of_one(tmp_path: Path) -> None:
+    frames = [(k / 10, [Obj(id=1), Obj(id=2, x=300.0)]) for k in range(5)]
+    write_recording(tmp_path / "drive.mcap", frames, host=1)
+    text = changed("  mast: {on: {classes: [car], share: 1}, pem: onboard}", "measure: {onset: {kind: appears}}")
+    assert before(tmp_path, text)[1] == f"drive: unit mast, on 1 of its 1 carrier: {UNMET}"
+
+
+def test_a_log_that_is_named_twice(here: Path) -> None:
+    drive(here / "other.mcap")
+    (here / "link.mcap").symlink_to("drive.mcap")
+    text = changed("logs: ['d*.mcap', other.mcap, drive.mcap, link.mcap]")
+    expected = ["drive: named more than once (logs[0], logs[2], logs[3]): replayed once"]
+    assert before(here, text) == expected
+    assert after(here, text) == expected
+
+
+def test_notes_of_the_recording_are_among_them(tmp_path: Path) -> None:
+    frames = [(k / 10, [Obj(id=1), Obj(id=2, x=30.0, vx=None)]) for k in range(5)]
+    write_recording(tmp_path / "drive.mcap", frames, host=1)
+    found = before(tmp_path, TEXT)
+    assert found
+    assert found == after(tmp_path, TEXT)[: len(found)]
+
+
+def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
+    monkeypatch.setattr(memory, "free_bytes", lambda: free)
+
+
+class TestMemory:
+    """One object has an onset: in three configurations three rows a run, of 1000 bytes, or 250 at least."""
+
+    def rows(self, here: Path) -> tuple[Experiment, list[Replay]]:
+        experiment, _, ready = made(here, changed("runs: 1000000", "measure: {accuracy: false}"))
+        assert [len(replay.looks.object_ix) for replay in ready] == [1]
+        return experiment, ready
+
+    def test_enough(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        experiment, ready = self.rows(here)
+        for free in (None, 3_000_000_000):
+            with_free(monkeypatch, free)
+            assert memory.memory_notes(ready, experiment) == []
+
+    def test_perhaps_not(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        experiment, ready = self.rows(here)
+        for free in (2_999_999_999, 750_000_000):
+            with_free(monkeypatch, free)
+            (said,) = memory.memory_notes(ready, experiment)
+            assert said == f"1000000 runs of 3 rows each may take 3 GB, and {free / 1e9:.3g} GB are free"
+
+    def test_certainly_not(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        experiment, ready = self.rows(here)
+        with_free(monkeypatch, 749_999_999)
+        said = "^1000000 runs of 3 rows each take at least 0.75 GB, and 0.75 GB are free; take 249999 or fewer$"
+        with pytest.raises(ExperimentError, match=said):
+            memory.memory_notes(ready, experiment)
+
+    def test_run_refuses_before_it_begins(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        experiment, recordings, _ = made(here, changed("runs: 1000000000"))
+        with pytest.raises(ExperimentError, match=r"1000000000 runs of 3 rows each take at least 1\.2e\+03 GB"):
+            run(experiment, recordings)
+
+    def test_what_is_free(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        files: dict[str, Any] = {"/proc/meminfo": "MemTotal: 9 kB\nMemAvailable:   6 kB\nSwapFree:  1 kB\n"}
+        monkeypatch.setattr(memory, "_text", lambda path: files.get(path, ""))
+        assert memory.free_bytes() == 7 * 1024
+        group = "/sys/fs/cgroup/memory."
+        files |= {f"{group}max": "5000\n", f"{group}current": "4000\n", f"{group}stat": "anon 3500\nfile 400\n"}
+        assert memory.free_bytes() == 1400
+        files[f"{group}max"] = "max\n"
+        assert memory.free_bytes() == 7 * 1024
+        files.clear()
+        assert memory.free_bytes() is None

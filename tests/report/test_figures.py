@@ -1,0 +1,654 @@
+"""Figures: what they are drawn from is read back from their artists and compared with what can be computed in the head.
+
+The scene: the ego (1), 4 m long, drives at 10 m/s along x for 5 s. A pedestrian (2), 0.5 m deep, stands in its way at
+30 m; another (3) stands 30 m aside. The clock starts at 0.5 s: the ego is at 5 m, 25 m from him, 22.75 m from box to
+box. Its driver reacts after 0.2 s and brakes with 8 m/s², which takes 1.25 s and 6.25 m. Known after l seconds, it
+stops 14.5 − 10 l metres before him.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import InputError
+from copem_replay.experiment.file import load, log_paths
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.metrics.intervals import resamples, share_limits
+from copem_replay.metrics.summary import clusters
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
+from copem_replay.pipeline.run import run
+from copem_replay.report.figures import (
+    Results,
+    curves_figure,
+    distances_figure,
+    load_results,
+    runs_figure,
+    sweeps_figure,
+    write_figures,
+)
+from copem_replay.report.figures.bands import band, resampled_incidence
+from copem_replay.report.figures.captions import percent, short_names
+from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, spread
+from copem_replay.report.figures.label_layout import last_instant
+from copem_replay.report.figures.selection import choose
+from copem_replay.report.figures.style import appearances
+from copem_replay.report.figures.timeline import Event
+from copem_replay.results.write import write_results
+from tests.helpers.recordings import Obj, pedestrian, write_recording
+
+TEXT = """\
+version: 1
+logs: [drive.mcap]
+runs: 3
+seed: 1
+pems:
+  sure: [{detection: {kind: constant, probability: 1.0}}]
+  blind: [{when: {classes: [animal]}, detection: {kind: constant, probability: 1.0}}]
+units:
+  ego: {on: ego, height_m: 1.8, pem: sure}
+  eye: {on: ego, height_m: 1.8, pem: blind}
+configurations:
+  GT: {units: truth}
+  late: {units: [ego], latency_s: 0.5}
+  near: {units: [ego], latency_s: 1.42}
+  hit: {units: [ego], latency_s: 1.8}
+  never: {units: [eye]}
+measure: {onset: {kind: at, time_s: 0.5}}
+braking: {driver: {kind: constant_deceleration, a_max_mps2: 8.0, reaction: {kind: constant, delay_s: 0.2}}}
+show: null
+"""
+TWO = "measure: {objects: {ids: [2]}, onset: {kind: at, time_s: 0.5}}"
+NAMES = ("runs", "distances", "curves")
+
+
+def drive(path: Path) -> Path:
+    frames = [
+        (0.1 * k, [Obj(id=1, x=1.0 * k, vx=10.0), pedestrian(2, 30.0), pedestrian(3, 30.0, 30.0)]) for k in range(51)
+    ]
+    return write_recording(path, frames, host=1)
+
+
+def changed(*changes: str, text: str = TEXT) -> str:
+    """The text with lines replaced by key; a change `key:` alone takes the line out."""
+    for change in changes:
+        key = change.partition(":")[0] + ":"
+        lines = [line for line in text.splitlines() if not line.startswith(key)]
+        text = "\n".join([*lines, *([change] if change != key else [])]) + "\n"
+    return text
+
+
+def replayed(place: Path, text: str = TEXT, name: str = "results") -> Path:
+    """A results folder beside the recording it is of."""
+    drive(place / "drive.mcap")
+    (place / "e.yaml").write_text(text, encoding="utf-8")
+    source = load(place / "e.yaml")
+    experiment, found = problems(source)
+    assert experiment is not None, found
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source)
+    assert not refused + found
+    write_results(place / name, experiment, recordings, run(experiment, recordings), overwrite=True)
+    return place / name
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of the scene: to be read, not to be written to."""
+    return replayed(tmp_path_factory.mktemp("made"))
+
+
+@pytest.fixture(scope="module")
+def results(made: Path) -> Results:
+    return load_results(made)
+
+
+@pytest.fixture
+def mine(made: Path, tmp_path: Path) -> Path:
+    """A copy of them, with its recording."""
+    shutil.copytree(made.parent, tmp_path / "mine")
+    return tmp_path / "mine" / "results"
+
+
+class Ended(NamedTuple):
+    code: int
+    out: list[str]
+    lines: list[str]
+    """Of stderr."""
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended]:
+    def called(*arguments: object) -> Ended:
+        monkeypatch.setattr(sys, "argv", ["copem-replay", "plot", *map(str, arguments)])
+        capsys.readouterr()
+        code = cli._ended()
+        out, err = capsys.readouterr()
+        return Ended(code, out.splitlines(), err.splitlines())
+
+    return called
+
+
+def line(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of the one line of a label."""
+    (found,) = (one for one in axes.get_lines() if one.get_label() == label)
+    return np.asarray(found.get_xdata(), dtype=float), np.asarray(found.get_ydata(), dtype=float)
+
+
+def at(axes: Axes, label: str, x: float) -> float:
+    """y of a line at x, linear between its vertices."""
+    return float(np.interp(x, *line(axes, label)))
+
+
+def events(axes: Axes) -> list[tuple[str, float]]:
+    """The labels of a column of runs, and when."""
+    notes = [text for text in axes.texts if isinstance(text, Annotation)]
+    return [(text.get_text(), pytest.approx(text.xy[0], abs=0.011)) for text in notes]
+
+
+def points(axes: Axes) -> dict[str, np.ndarray]:
+    """Distances of the points of each label."""
+    return {str(c.get_label()): np.asarray(c.get_offsets())[:, 0] for c in axes.collections if len(c.get_offsets())}
+
+
+def note(figure: Figure) -> str:
+    return " ".join(figure.texts[-1].get_text().split())
+
+
+class TestCommand:
+    def test_writes_the_figures_and_prints_their_names(self, call: Callable[..., Ended], mine: Path) -> None:
+        ended = call(mine)
+        names = [f"{name}.{kind}" for name in NAMES for kind in ("png", "svg")]
+        assert (ended.code, ended.lines) == (0, [])
+        assert ended.out == [str(mine / "figures" / name) for name in names]
+        assert sorted(path.name for path in (mine / "figures").iterdir()) == sorted(names)
+        assert not list(mine.glob(".*"))
+
+    def test_the_same_bytes_twice(self, results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        first, _ = write_figures(results, tmp_path / "a" / "deep")
+        monkeypatch.setitem(matplotlib.rcParams, "font.size", 20.0)  # whatever the user likes
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", "1")
+        second, _ = write_figures(load_results(results.folder), tmp_path / "b")
+        assert len(first) == 6
+        assert {p.name: p.read_bytes() for p in first} == {p.name: p.read_bytes() for p in second}
+        for path in first:
+            content = path.read_bytes()
+            assert matplotlib.__version__.encode() not in content
+            assert b"dc:date" not in content
+
+    def test_settings_are_left_as_they_were(self, results: Results) -> None:
+        before = dict(matplotlib.rcParams)
+        curves_figure(results)
+        assert dict(matplotlib.rcParams) == before
+
+    def test_out_keeps_what_is_not_ours(self, call: Callable[..., Ended], mine: Path, tmp_path: Path) -> None:
+        (tmp_path / "paper").mkdir()
+        (tmp_path / "paper" / "text.tex").write_text("mine")
+        (tmp_path / "paper" / "sweeps.png").write_text("of an earlier call")
+        assert call(mine, "--out", tmp_path / "paper").code == 0
+        assert {p.name for p in (tmp_path / "paper").iterdir()} == {
+            "text.tex", *(f"{name}.{kind}" for name in NAMES for kind in ("png", "svg"))
+        }  # fmt: skip
+        assert not (mine / "figures").exists()
+
+    @pytest.mark.parametrize(
+        ("damage", "said"),
+        [
+            (lambda log: log.unlink(), "drive.mcap: cannot be opened: No such file or directory; put the log back"),
+            (lambda log: log.write_bytes(log.read_bytes() + b"x"), "drive.mcap: expected the log that was replayed"),
+        ],
+    )
+    def test_without_the_log_the_runs_are_left_out(
+        self, call: Callable[..., Ended], mine: Path, damage: Callable[[Path], object], said: str
+    ) -> None:
+        (mine / "figures").mkdir()
+        (mine / "figures" / "runs.png").write_text("of an earlier call")
+        damage(mine.parent / "drive.mcap")
+        ended = call(mine)
+        assert ended.code == 0
+        (text,) = ended.lines
+        assert text.startswith("note: no figure of runs: ")
+        assert said in text
+        # Nor does an old one stay, of a log that is no more.
+        assert [Path(out).name for out in ended.out] == ["distances.png", "distances.svg", "curves.png", "curves.svg"]
+        assert {p.stem for p in (mine / "figures").iterdir()} == {"distances", "curves"}
+
+    @pytest.mark.parametrize(
+        ("options", "said"),
+        [
+            (
+                ["--configurations", "GT,PEM"],
+                "configurations: expected some of GT, late, near, hit, never, found 'PEM'",
+            ),
+            (["--run", "3"], "run: expected 0 to 2, found 3"),
+            (["--object", "7"], "object: expected one of 2, 3; found '7'"),
+            (["--log", "other"], "log: expected one of drive; found 'other'"),
+        ],
+    )
+    def test_what_is_not_there(self, call: Callable[..., Ended], mine: Path, options: Sequence[str], said: str) -> None:
+        ended = call(mine, *options)
+        assert (ended.code, ended.out, ended.lines) == (2, [], [f"{mine}: {said}"])
+        assert not (mine / "figures").exists()
+
+    @pytest.mark.parametrize(
+        ("file", "content", "said"),
+        [
+            (
+                "detections.parquet",
+                b"PAR1 no",
+                "/detections.parquet: expected a table that can be read, found damage: ",
+            ),
+            ("detections.parquet", None, ": expected a results folder, found no detections.parquet in it; "),
+            ("provenance.json", b"{", "/provenance.json: expected the provenance of results, found damage: "),
+            ("provenance.json", b"{}", "/provenance.json: expected the provenance of results, found damage: no 'logs'"),
+            ("summary.csv", b"a,b\n1,2\n", "/summary.csv: expected the column configuration, found none; run the "),
+            ("summary.csv", b"", "/summary.csv: expected a table that can be read, found damage: "),
+            ("summary.csv", b"configuration,n,list_rate_hz\nGT,3,x\n", "/summary.csv: column list_rate_hz: expected "),
+            ("experiment.yaml", b"version: 1\n", "/experiment.yaml:1: logs: missing"),
+            ("sweep.csv", b"sweep,value\nunits,1\n", "/sweep.csv: expected the column configuration, found none; "),
+        ],
+    )
+    def test_damaged_results(
+        self, call: Callable[..., Ended], mine: Path, file: str, content: bytes | None, said: str
+    ) -> None:
+        (mine / file).unlink(missing_ok=True)
+        if content is not None:
+            (mine / file).write_bytes(content)
+        ended = call(mine)
+        assert (ended.code, ended.out) == (2, [])
+        assert said in ended.lines[0]
+        assert all(text.startswith(str(mine)) for text in ended.lines)
+        assert file == "experiment.yaml" or len(ended.lines) == 1
+
+    def test_rows_that_are_not_of_this_experiment(self, call: Callable[..., Ended], mine: Path) -> None:
+        table = pd.read_parquet(mine / "detections.parquet")
+        for rows, said in (
+            (table.replace("late", "later"), "expected the configurations of experiment.yaml, found 'later'"),
+            (table[table["configuration"] != "late"], "expected as many rows of each configuration, found 0 to 6"),
+            (table.iloc[:0], "expected rows to draw, found none"),
+        ):
+            rows.to_parquet(mine / "detections.parquet")
+            ended = call(mine)
+            assert ended.code == 2
+            assert said in ended.lines[0]
+
+    def test_no_folder(self, call: Callable[..., Ended], mine: Path, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        for place, said in (
+            (tmp_path / "none", "expected a results folder, found no such folder; `copem-replay run` writes one"),
+            (mine / "summary.csv", "expected a results folder, found a file; `copem-replay run` writes one"),
+            (tmp_path / "empty", "expected a results folder, found no provenance.json in it; "),
+        ):
+            ended = call(place)
+            assert (ended.code, ended.out, len(ended.lines)) == (2, [], 1)
+            assert ended.lines[0].startswith(f"{place}: {said}")
+
+    def test_nothing_is_half_written(
+        self, call: Callable[..., Ended], mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        ended = call(mine, "--out", mine / "summary.csv")
+        assert ended.code == 2
+        assert ended.lines[0].endswith("expected a folder, found a file; choose another with --out")
+        write = Figure.savefig
+
+        def full(figure: Figure, path: Path, **more: Any) -> None:
+            if path.name == "curves.svg":
+                path.write_text("half")
+                raise OSError(28, "No space left on device")
+            write(figure, path, **more)
+
+        monkeypatch.setattr(Figure, "savefig", full)
+        ended = call(mine, "--out", tmp_path / "new")
+        assert (ended.code, ended.out) == (2, [])
+        assert ended.lines == [f"{tmp_path}/new: cannot be written: No space left on device; choose another with --out"]
+        assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+    def test_matplotlib_is_imported_where_it_is_used(self) -> None:
+        code = "import sys, copem_replay.cli.main, copem_replay.report.figures; sys.exit('matplotlib' in sys.modules)"
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+class TestRuns:
+    def test_from_worst_to_best(self, results: Results) -> None:
+        # hit, near and never do not pass; of them who never knows is worst, then who knows last.
+        choice = choose(results)
+        assert (choice.log, choice.object_id, choice.run) == ("drive", "2", 0)
+        assert choice.configurations == ("never", "hit", "late", "GT")
+        assert choose(results, configurations=["hit", "GT", "hit"]).configurations == ("hit", "GT")
+        assert choose(results, object_id="3", run=2).object_id == "3"
+
+    def test_courses_and_events(self, results: Results) -> None:
+        figure = runs_figure(results, configurations=["GT", "near", "hit", "never"], run=1)
+        columns = np.array(figure.axes).reshape(3, 4).T
+        titles = [column[0].get_title(loc="left") for column in columns]
+        assert titles == [
+            "GT\nknown after 0 s, passes", "near\nknown after 1.42 s, fails",
+            "hit\nknown after 1.8 s, fails", "never\nnever known, fails",
+        ]  # fmt: skip
+        begin = [("clock starts", 0.0), ("captured", 0.0)]
+        assert events(columns[0][0]) == [*begin, ("list arrives", 0.0), ("brakes", 0.2), ("stops", 1.45)]
+        # It brakes 6.55 m before him and is 0.5 m away after τ s: 6.55 − 10 τ + 4 τ² = 0.5, so τ = (10 − √3.2) / 8.
+        near = ("too near: 0.30 m", 1.62 + (10 - 3.2**0.5) / 8)
+        assert events(columns[1][0]) == [*begin, ("list arrives", 1.42), ("brakes", 1.62), near]
+        # It brakes 2.75 m before him: 2.75 = 10 τ − 4 τ², and is still √(100 − 2 · 8 · 2.75) = 7.48 m/s fast.
+        hit = ("hits at 7.5 m/s", 2.0 + (10 - 56**0.5) / 8)
+        assert events(columns[2][0]) == [*begin, ("list arrives", 1.8), ("brakes", 2.0), hit]
+        assert events(columns[3][0]) == [("clock starts", 0.0), ("hits at 10.0 m/s", 2.275)]
+        speed, gap, share = columns[0]
+        assert [at(speed, "brakes", t) for t in (0.0, 0.2, 0.7, 1.4, 2.0)] == pytest.approx(
+            [10, 10, 6, 0.4, 0], abs=0.02
+        )
+        assert at(speed, "does not brake", 2.0) == pytest.approx(10)
+        # Before the onset, too: 1 m more a tenth of a second earlier.
+        assert [at(gap, "brakes", t) for t in (-0.1, 0.0, 0.2)] == pytest.approx([23.75, 22.75, 20.75], abs=1e-6)
+        assert [at(gap, "brakes", t) for t in (1.45, 2.0)] == pytest.approx([14.5, 14.5], abs=1e-3)
+        assert [at(gap, "does not brake", t) for t in (1.0, 2.2)] == pytest.approx([12.75, 0.75])
+        assert set(line(gap, "margin")[1]) == {0.5}
+        # Until it brakes what it sees, then what it would see: wholly visible all the time.
+        assert line(share, "visible share")[0][-1] == pytest.approx(0.2)
+        assert set(line(share, "visible share")[1]) == set(line(share, "without braking")[1]) == {1.0}
+        # The one that hits ends there.
+        x, y = line(columns[2][0], "brakes")
+        assert (x[-1], y[-1]) == pytest.approx((2.0 + (10 - 56**0.5) / 8, 56**0.5), abs=0.01)
+        assert line(columns[2][1], "hits")[1] == pytest.approx([0], abs=1e-6)
+
+    def test_without_a_conflict(self, results: Results) -> None:
+        # The other stands 30 m aside: nearest where the ego passes, 30 − 1 − 0.3 m, 2.5 s after the onset.
+        figure = runs_figure(results, object_id="3", configurations=["late", "never"])
+        speed, gap = (figure.axes[k] for k in (0, 2))
+        assert speed.get_title(loc="left") == "late\nknown after 0.5 s, no conflict"
+        assert [label for label, _ in events(speed)] == ["clock starts", "captured", "list arrives", "nearest: 28.7 m"]
+        assert [label for label, _ in events(figure.axes[1])] == ["clock starts", "nearest: 28.7 m", "log ends"]
+        assert at(gap, "as recorded", 2.5) == pytest.approx(28.7)
+        x, y = line(speed, "as recorded")
+        assert set(np.round(y[(x >= -0.4) & (x <= 4.5)], 9)) == {10.0}
+        assert np.isnan(y[x > 4.51]).all()  # the log has ended
+
+    def test_without_braking(self, tmp_path: Path) -> None:
+        text = changed("braking:", "configurations: {GT: {units: truth}, PEM: {units: [ego]}}", text=TEXT)
+        text = "\n".join(
+            row for row in text.splitlines() if not row.startswith("  ") or "probab" in row or "on: ego" in row
+        )
+        figure = runs_figure(load_results(replayed(tmp_path, text)))
+        assert figure.axes[1].get_title(loc="left") == "GT\nknown after 0 s"
+        assert events(figure.axes[1])[-1] == ("nearest: 0.0 m", 2.3)
+        assert figure.axes[3].get_lines()[0].get_label() == "as recorded"
+        assert "declared driver" not in note(figure)
+
+    def test_labels_have_room(self) -> None:
+        # The later label takes 12.5 letters of 0.56 · 7.5 pt: 0.729 of 2 inches, so that 1 s are what is left of it.
+        listed = [Event(0.0, "onset", "x"), Event(1.0, "outcome", "a long one.")]
+        assert last_instant(listed, 0.0, 1.2, 2.0) == pytest.approx(1 / (1 - 12.5 * 0.56 * 7.5 / 72 / 2))
+        assert last_instant(listed[:1], 0.0, 1.2, 2.0) == 1.2
+
+    def test_no_ego_unit(self, results: Results, mine: Path) -> None:
+        text = (mine.parent / "e.yaml").read_text().replace("on: ego", "at: [0, 0]")
+        figure = runs_figure(load_results(replayed(mine.parent, text, "fixed")))
+        assert figure.axes[-1].texts[0].get_text() == "the ego carries no unit"
+
+
+class TestDistances:
+    def test_points(self, results: Results) -> None:
+        figure = distances_figure(results)
+        (axes,) = figure.axes
+        found = points(axes)
+        aside = float(np.hypot(25, 30))
+        # Three runs each. The ego is 5 + 10 l metres on when it knows.
+        assert set(found) == {
+            "GT: passes", "late: passes", "near: fails", "hit: fails",
+            *(f"{name}: not in conflict" for name in ("GT", "late", "near", "hit")),
+        }  # fmt: skip
+        assert found["GT: passes"] == pytest.approx([25.0] * 3)
+        assert found["late: passes"] == pytest.approx([20.0] * 3)
+        assert found["near: fails"] == pytest.approx([10.8] * 3)
+        assert found["hit: fails"] == pytest.approx([7.0] * 3)
+        assert found["GT: not in conflict"] == pytest.approx([aside] * 3)
+        assert [text.get_text() for text in axes.get_yticklabels()] == ["GT", "late", "near", "hit", "never"]
+        counts = [text.get_text() for text in axes.texts if text.get_text().isdigit()]
+        assert counts == ["0", "0", "0", "0", "6"]
+        shares = [text.get_text() for text in axes.texts if "%" in text.get_text()]
+        assert shares == ["100 %", "100 %", "0 %", "0 %", "0 %"]
+        assert "n = 6 per configuration, seed 1. 10 fused lists per second" in note(figure).replace("\u00a0", " ")
+
+    def test_markers_tell_pass_from_fail(self, results: Results) -> None:
+        (axes,) = distances_figure(results, configurations=["GT", "hit"]).axes
+        paths = {
+            str(c.get_label()): c.get_paths()[0].vertices.tobytes() for c in axes.collections if len(c.get_offsets())
+        }
+        colours = {
+            str(c.get_label()): tuple(c.get_edgecolor()[0][:3]) for c in axes.collections if len(c.get_offsets())
+        }
+        kinds = ("GT: passes", "hit: fails", "GT: not in conflict")
+        assert len({paths[kind] for kind in kinds}) == len({colours[kind] for kind in kinds}) == 3
+
+    def test_foreseen_collisions_have_a_panel(self, mine: Path) -> None:
+        table = pd.read_parquet(mine / "detections.parquet")
+        table["conflict_detected"] = table["configuration"] == "GT"
+        table["distance_at_conflict_detection_m"] = np.where(table["conflict_detected"], 12.0, np.nan)
+        table.loc[0, "distance_at_conflict_detection_m"] = np.nan  # while the truth has a gap
+        table.to_parquet(mine / "detections.parquet")
+        figure = distances_figure(load_results(mine))
+        assert len(figure.axes) == 2
+        # He brakes for the object, so that passing says nothing of this event.
+        assert points(figure.axes[1]) == {"GT: not in conflict": pytest.approx([12.0] * 5)}
+        assert [text.get_text() for text in figure.axes[1].texts if text.get_text().isdigit()] == ["0", *["6"] * 4]
+        assert "Without a point: 1 detection" in note(figure)
+
+    def test_spread_is_as_wide_as_there_are_many(self) -> None:
+        across = spread(
+            np.array([5.0, 5.0, 5.0, 5.0, 9.0, 7.0, 7.01]), [PASS, FAIL, PASS, NEUTRAL, PASS, PASS, PASS], 0.5
+        )
+        # Four in a bin: the middles of quarters of −1 … 1, failures first; one alone: 0; two over half of it.
+        assert across == pytest.approx([0.25, -0.75, 0.75, -0.25, 0, -0.25, 0.25])
+
+
+class TestCurves:
+    def test_steps(self, results: Results) -> None:
+        figure = curves_figure(results)
+        (axes,) = figure.axes
+        for name, late_s, last in (("GT", 0.0, 1.0), ("late", 0.5, 1.0), ("hit", 1.8, 1.0)):
+            x, y = line(axes, name)
+            assert x[1:-1] == pytest.approx([late_s])
+            assert y == pytest.approx([0, last, last])
+            assert (x[0], x[-1]) == pytest.approx(axes.get_xlim())
+        assert list(line(axes, "never")[1]) == [0, 0]
+        assert "No bands: fewer than 5 logs and fewer than 5 objects" in note(figure)
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["GT", "late", "near", "hit", "never"]
+
+    def test_one_object_has_bands_over_runs(self, tmp_path: Path) -> None:
+        # One in two lists holds him, so that the runs differ.
+        text = changed(TWO, "runs: 40", text=TEXT.replace("sure: [{detection: {kind: constant, probability: 1.0}}]",
+                       "sure: [{detection: {kind: constant, probability: 0.5}}]"))  # fmt: skip
+        results = load_results(replayed(tmp_path, text))
+        figure = curves_figure(results, configurations=["late"])
+        (axes,) = figure.axes
+        rows = results.table[results.table["configuration"] == "late"]
+        times_s, share = cumulative_incidence(rows["time_to_detection_s"].to_numpy(), np.full(40, DETECTED))
+        assert line(axes, "late")[1][1:-1] == pytest.approx(share)
+        (drawn,) = (c for c in axes.collections if c.get_label() == "band of late")
+        corners = drawn.get_paths()[0].vertices
+        # Around the first step: the binomial band of 40 runs is about ± 2 √(p (1 − p) / 40) wide.
+        at_first = corners[np.isclose(corners[:, 0], times_s[0])][:, 1]
+        low, high = at_first[at_first > 0].min(), at_first.max()
+        half = 1.96 * (share[0] * (1 - share[0]) / 40) ** 0.5
+        assert (low, high) == (pytest.approx(share[0] - half, abs=0.05), pytest.approx(share[0] + half, abs=0.05))
+        assert "Bands: 95 %, bootstrap over whole runs, or exact binomial limits where few decide" in note(figure)
+
+    def test_exact(self, mine: Path) -> None:
+        # Of two objects one is known at once or after a second, the other half the time after a second, else never.
+        columns = ["object_id", "time_to_detection_s", "probability"]
+        rows = [("2", 0.0, 0.5), ("2", 1.0, 0.5), ("3", 1.0, 0.5), ("3", None, 0.5), ("3", 2.0, 0.0)]
+        exact = pd.DataFrame(rows, columns=columns).assign(log="drive", configuration="GT")
+        exact.to_parquet(mine / "exact.parquet")
+        figure = curves_figure(load_results(mine), configurations=["GT"])
+        x, y = line(figure.axes[0], "exact")
+        assert x[1:-1] == pytest.approx([0, 1])
+        assert y == pytest.approx([0, 0.25, 0.75, 0.75])
+        assert "Dashed: the exact share detected by then" in note(figure)
+
+
+class TestBands:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_all_resamples_at_once_are_as_each_by_itself(self, seed: int) -> None:
+        generator = np.random.default_rng(seed)
+        n, resamples = 40, 7
+        time_s = np.sort(generator.integers(0, 12, n) / 4)  # many ties
+        ending = generator.choice([CENSORED, DETECTED, LEFT], n)
+        count = generator.integers(0, 3, (resamples, n))
+        at_s = np.arange(-1, 4, 0.125)
+        found = resampled_incidence(time_s, ending, count, at_s)
+        for r in range(resamples):
+            rows = np.repeat(np.arange(n), count[r])
+            times_s, share = cumulative_incidence(time_s[rows], ending[rows])
+            k = np.searchsorted(times_s, at_s, side="right")
+            assert found[r] == pytest.approx(np.append(0.0, share)[k])
+
+    def test_clusters_stay_whole(self) -> None:
+        # Each of five objects is always or never known: a share is then a number of fifths.
+        time_s = np.repeat([1.0, 1.0, 1.0, 5.0, 5.0], 20)
+        ending = np.repeat([DETECTED, DETECTED, DETECTED, LEFT, LEFT], 20)
+        names = np.repeat(list("abcde"), 20)
+        low, high = band(time_s, ending, list(names), np.array([0.5, 1.0]), 1)
+        # None known by then: none of five, 1 − 0.025^(1/5). Then three of five: all or none is drawn often enough.
+        assert (low[0], high[0]) == (0, pytest.approx(0.521824, abs=1e-6))
+        assert (low[1], high[1]) == (0.0, 1.0)
+
+    def test_bands_end_where_the_summary_does(self) -> None:
+        """Twelve objects of 20 runs: at last the share detected and its limits, but for fewer resamples."""
+        generator = np.random.default_rng(4)
+        totals, known = np.full(12, 20), generator.binomial(20, generator.beta(4, 1, 12))
+        names = [f"object {k}" for k in range(12)]
+        rows = [(name, DETECTED if k < n else LEFT) for name, n in zip(names, known, strict=True) for k in range(20)]
+        cluster, ending = [name for name, _ in rows], np.array([how for _, how in rows])
+        low, high = band(np.ones(240), ending, cluster, np.array([1.0]), 1)
+        kind, least, most = share_limits(known, totals, resamples(sorted(names), 1))
+        assert kind == "bootstrap+exact"
+        assert (low[0], high[0]) == pytest.approx((least, most), abs=0.02)
+
+    def test_which_clusters(self) -> None:
+        def rows(logs: int, things: int, runs: int = 2) -> pd.DataFrame:
+            index = pd.MultiIndex.from_product(
+                [range(logs), range(things), range(runs)], names=["log", "object_id", "run"]
+            )
+            return index.to_frame(index=False)
+
+        assert clusters(rows(1, 1))[0] == "runs"
+        assert clusters(rows(1, 1))[1].nunique() == 2
+        assert clusters(rows(1, 4))[0] is None
+        assert clusters(rows(1, 5))[0] == "objects"
+        assert clusters(rows(4, 2))[0] == "objects"
+        assert clusters(rows(5, 1))[0] == "logs"
+
+
+class TestSweeps:
+    @pytest.fixture
+    def swept(self, mine: Path) -> Results:
+        rows = [
+            ("latency_s", 0.5, "late", 10.0, 0.9, 0.8, 1.0, 0.6, 0.7, None, 0.8, 0.7, 0.9),
+            ("latency_s", 0.0, "late", 10.0, 1.0, 0.9, 1.0, 0.1, 0.2, 0.3, 0.9, 0.8, 1.0),
+            ("latency_s", 0.0, "GT", 10.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0),
+            ("rate_hz", 2.0, "late", 2.0, 0.4, 0.3, 0.5, 0.2, None, None, None, None, None),
+        ]
+        columns = ["sweep", "value", "configuration", "list_rate_hz", "detected_share", "detected_share_low",
+                   "detected_share_high", "ttd_p5_s", "ttd_median_s", "ttd_p95_s", "pass_share", "pass_share_low",
+                   "pass_share_high"]  # fmt: skip
+        table = pd.DataFrame(rows, columns=columns).assign(n=6, interval="wilson", interval_over="runs")
+        table["pass_share_exact"] = [0.79, 0.91, 1.0, None]
+        table.to_csv(mine / "sweep.csv", index=False)
+        return load_results(mine)
+
+    def test_panels(self, swept: Results) -> None:
+        figure = sweeps_figure(swept)
+        panels = np.array(figure.axes).reshape(3, 2)
+        labels = [axes.get_xlabel() for axes in panels[2]]
+        assert labels == ["Latency (s)", "Rate of the units (lists per second)"]
+        passes, detected, times = panels[:, 0]
+        assert [list(v) for v in line(passes, "late")] == [[0, 0.5], [0.9, 0.8]]
+        assert [list(v) for v in line(detected, "late")] == [[0, 0.5], [1.0, 0.9]]
+        assert [list(v) for v in line(times, "late")] == [[0, 0.5], [0.2, 0.7]]
+        assert [list(v) for v in line(passes, "GT")] == [[0], [1.0]]
+        exact = [[list(v) for v in one.get_data()] for one in passes.get_lines() if one.get_label() == "exact"]
+        assert exact == [[[0, 0.5], [0.91, 0.79]], [[0], [1.0]]]
+        names = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert names == ["late (latency swept)", "late", "GT (latency swept)", "exact"]
+        (drawn,) = (c for c in detected.collections if c.get_label() == "band of late")
+        assert {tuple(v) for v in drawn.get_paths()[0].vertices} == {(0, 0.9), (0, 1), (0.5, 0.8), (0.5, 1)}
+        # The 95 % quantile at 0.5 s is among the never detected: the band goes on beyond the axis.
+        (drawn,) = (c for c in times.collections if c.get_label() == "band of late")
+        corners = drawn.get_paths()[0].vertices
+        assert corners[np.isclose(corners[:, 0], 0.5)][:, 1].max() > times.get_ylim()[1]
+        assert 0.7 < times.get_ylim()[1] < 1
+        said = note(figure).replace("\u00a0", " ")
+        assert (
+            "n = 6 per point, seed 1. Latency: 10 fused lists per second. "
+            "Bands of shares: 95 %, Wilson interval over runs" in said
+        )
+        assert "reaches the top" in said
+
+    def test_only_some(self, swept: Results) -> None:
+        figure = sweeps_figure(swept, configurations=["GT"])
+        assert len(figure.axes) == 3
+        with pytest.raises(InputError, match="expected rows of never, found none"):
+            sweeps_figure(swept, configurations=["never"])
+
+    def test_the_command_draws_them(self, call: Callable[..., Ended], swept: Results) -> None:
+        ended = call(swept.folder)
+        assert [Path(out).name for out in ended.out[-2:]] == ["sweeps.png", "sweeps.svg"]
+        ended = call(swept.folder, "--configurations", "never")
+        assert (ended.code, len(ended.out)) == (0, 6)
+        assert ended.lines == [f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never"]
+
+    def test_none(self, results: Results) -> None:
+        with pytest.raises(InputError, match=r"expected sweep\.csv in it, found none"):
+            sweeps_figure(results)
+
+
+class TestWords:
+    def test_names_that_are_too_long_lose_their_middle(self) -> None:
+        names = short_names(["GT", "roadside units of the crossing, 0.5 s"])
+        assert names == {"GT": "GT", "roadside units of the crossing, 0.5 s": "roadside unit…ssing, 0.5 s"}
+        alike = ["a" * 20 + "1" + "b" * 20, "a" * 20 + "2" + "b" * 20]
+        assert list(short_names(alike).values()) == alike
+
+    def test_percent(self) -> None:
+        shares = [0, 1, 0.5, 0.996, 0.9999, 0.001, 0.0001, float("nan")]
+        assert [percent(share) for share in shares] == [
+            "0 %", "100 %", "50 %", "99.6 %", "> 99.9 %", "0.1 %", "< 0.1 %", "–",
+        ]  # fmt: skip
+
+    def test_odd_names_are_drawn_as_they_are(self, tmp_path: Path) -> None:
+        text = changed("runs: 1").replace("  late:", '  "$a$_{<&>}":').replace("  hit:", '  "_試":')
+        results = load_results(replayed(tmp_path, text))
+        files, notes = write_figures(results)
+        assert (len(files), notes) == (6, [])
+        labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
+        assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
+
+    def test_looks_differ(self) -> None:
+        looks = appearances([f"c{k}" for k in range(9)])
+        assert len({(look.dashes, look.colour) for look in looks.values()}) == 9
+        assert len({look.dashes for look in list(looks.values())[:7]}) == 7
+        # The yellow alone needs an outline, of the first seven; and the first line is the widest.
+        outlined = [name for name, look in looks.items() if look.edge != look.colour]
+        assert outlined[:1] == ["c3"]
+        widths = [look.width_pt for look in looks.values()]
+        assert widths == sorted(widths, reverse=True)
+
+    def test_provenance_is_of_the_experiment(self, mine: Path) -> None:
+        found = json.loads((mine / "provenance.json").read_text())
+        (mine / "provenance.json").write_text(json.dumps(found | {"logs": []}))
+        with pytest.raises(InputError, match=r"expected 1 logs as in experiment\.yaml, found 0"):
+            load_results(mine)

@@ -1,0 +1,620 @@
+"""The report, read back from its HTML: its numbers are those of the tables, its words those of the case."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+import plotly.graph_objects as go
+import pytest
+
+from copem_replay.cli import main as cli
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.metrics.summary_text import summary_text
+from copem_replay.report import write_report
+from copem_replay.report.figures import load_results
+from copem_replay.report.figures.style import appearances
+from copem_replay.report.html.latency_breakdown import (
+    FUSION,
+    HIDDEN,
+    IN_SIGHT,
+    SINCE_CAPTURED,
+    TRANSPORT,
+    UNTIL_CAPTURED,
+    stages,
+)
+from copem_replay.report.html.markup import Html, tag
+from copem_replay.report.html.missed_objects import misses, powers
+from copem_replay.report.html.page import page
+from copem_replay.report.html.plotly_figures import rgb
+from copem_replay.report.html.study import load_study
+from copem_replay.results.compare import compare, comparison_text
+from tests.helpers.report_pages import ALONE, EVERY, ONE, Page, changed, drive, replayed
+
+NAMES = ("GT", "late", "half", "hit", "never")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of the scene: to be read, not to be written to."""
+    return replayed(tmp_path_factory.mktemp("made"), changed(ONE))
+
+
+@pytest.fixture(scope="module")
+def html(made: Path) -> str:
+    return page(load_study(made))
+
+
+@pytest.fixture(scope="module")
+def read(html: str) -> Page:
+    return Page(html)
+
+
+@pytest.fixture
+def mine(made: Path, tmp_path: Path) -> Path:
+    """A copy of them, with its recording."""
+    shutil.copytree(made.parent, tmp_path / "mine")
+    return tmp_path / "mine" / "results"
+
+
+class Ended(NamedTuple):
+    code: int
+    out: list[str]
+    lines: list[str]
+    """Of stderr."""
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended]:
+    def called(*arguments: object) -> Ended:
+        monkeypatch.setattr(sys, "argv", ["copem-replay", *map(str, arguments)])
+        capsys.readouterr()
+        code = cli._ended()
+        out, err = capsys.readouterr()
+        return Ended(code, out.splitlines(), err.splitlines())
+
+    return called
+
+
+def summary_rows(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "summary.csv").open(newline="", encoding="utf-8") as file:
+        return {row["configuration"]: row for row in csv.DictReader(file)}
+
+
+def lines_of(folder: Path) -> list[str]:
+    """What the top of a folder's report says."""
+    return Page(page(load_study(folder))).lines()
+
+
+class TestNumbers:
+    def test_the_summary_has_the_numbers_of_the_file(self, read: Page, made: Path) -> None:
+        rows = summary_rows(made)
+        checked = 0
+        for id_ in ("summary", "braking", "accuracy"):
+            assert list(read.tables[id_]) == list(NAMES)
+            for name, cells in read.tables[id_].items():
+                for column, cell in cells.items():
+                    assert (cell.value or "") == rows[name][column], (id_, name, column)
+                    if column in ("detected_share", "pass_share"):
+                        assert (cell.low or "") == rows[name][f"{column}_low"]
+                        assert (cell.high or "") == rows[name][f"{column}_high"]
+                    checked += 1
+        assert checked == len(NAMES) * (8 + 2 + 9)
+
+    def test_cells_read_as_in_the_terminal(self, read: Page, made: Path) -> None:
+        summary = load_results(made).summary.astype({"list_rate_hz": float})
+        printed = [re.split(r"\s{2,}", line) for line in summary_text(summary).splitlines()]
+        seen = 0
+        for id_, first in (
+            ("summary", 0),
+            ("braking", next(k for k, row in enumerate(printed) if "n_conflict" in row)),
+        ):
+            head = printed[first]
+            for line in printed[first + 1 : first + 1 + len(NAMES)]:
+                terminal = dict(zip(head, line, strict=True))
+                for column, cell in read.tables[id_][terminal["configuration"]].items():
+                    expected = terminal[column]
+                    if column in ("detected_share", "pass_share"):
+                        expected += f" {terminal['95 %']}".removesuffix(" –")
+                    assert cell.text == expected, (terminal["configuration"], column)
+                    seen += 1
+        assert seen == len(NAMES) * 10
+
+    def test_the_regret_is_that_of_compare(self, read: Page, made: Path) -> None:
+        comparison = compare([made], baseline="late")
+        printed = [re.split(r"\s{2,}", line) for line in comparison_text(comparison).splitlines()]
+        assert list(read.tables["regret"]) == [row[0] for row in printed[1:5]] == ["GT", "half", "hit", "never"]
+        for line in printed[1:5]:
+            for metric, expected in zip(printed[0][1:], line[1:], strict=True):
+                cell = read.tables["regret"][line[0]][metric]
+                assert cell.text == expected
+                row = comparison.overall.set_index(["configuration", "metric"]).loc[(line[0], metric)]
+                for found, wanted in ((cell.value, row.difference), (cell.low, row.low), (cell.high, row.high)):
+                    assert (found is None) == pd.isna(wanted)
+                    assert found is None or float(found) == pytest.approx(wanted, rel=1e-8, abs=1e-12)
+
+    def test_every_column_shown_is_explained(self, read: Page) -> None:
+        shown = {name for id_ in ("summary", "braking", "accuracy", "regret") for name in read.rows[id_][0][1:]}
+        terms = re.findall(r"<dt><code>(.*?)</code></dt><dd>(.+?)</dd>", read.html)
+        assert shown == {name for name, _ in terms}
+
+    def test_provenance_is_all_there(self, read: Page, made: Path) -> None:
+        data = json.loads((made / "provenance.json").read_text(encoding="utf-8"))
+        cells = {row[0]: row[1] for id_ in ("parameters", "libraries") for row in read.rows[id_]}
+        assert read.rows["logs"][1] == ["drive", "truth", data["logs"][0]["sha256"]]
+        assert {name: cells[name] for name in data["libraries"]} == data["libraries"]
+        expected = {
+            "seed": "1",
+            "runs": "6",
+            "copem_replay": data["copem_replay"],
+            "measure.onset.kind": "at",
+            "measure.objects.ids": "2",
+            "measure.match.gate_m": "3",
+            "measure.match.always": "false",
+            "measure.horizon_used_s": "4.5",
+            "braking.driver.reaction.delay_s": "0.2",
+        }
+        assert {name: cells[name] for name in expected} == expected
+
+
+class TestWords:
+    def test_who_wins_by_how_much_and_how_sure(self, made: Path) -> None:
+        lines = lines_of(made)
+        mean_s = float(summary_rows(made)["half"]["ttd_rmst_s"])
+        assert lines[2] == (
+            f"half knew soonest, after {mean_s:.4g} s on the average (never detected counting as 4.5 s), sooner "
+            "than the other 3."
+        )
+        difference = 0.5 - mean_s
+        assert lines[3].startswith(
+            f"Later than that, the interval of the difference excluding 0: late (+{difference:.3g} s ["
+        )
+        assert lines[3].index("hit (") < lines[3].index("never (")
+        assert "The winner was picked by these same figures, which flatters it a little." in lines
+        assert "Never knew of anybody: never." in lines
+        assert any(
+            line.startswith("Braking: of 6 rows in conflict 100 % [") and "pass with late, half" in line
+            for line in lines
+        )
+        assert any(line.startswith("GT: the truth itself") for line in lines)
+        assert any("over runs" in line and "do not tell about other traffic" in line for line in lines)
+
+    def test_without_intervals_it_says_so(self, tmp_path: Path) -> None:
+        lines = lines_of(replayed(tmp_path, changed()))
+        assert re.fullmatch(
+            r"2 objects, so no interval\. half has the shortest mean time, \S+ s "
+            r"\(never detected counting as 4\.5 s\)\.",
+            lines[2],
+        )
+        assert lines[3].startswith("After it, by differences without an interval: late (+")
+        assert "[" not in lines[3]
+        assert any(
+            line.startswith("How sure: there are no intervals, for there are fewer than 5 logs") for line in lines
+        )
+        assert not any("excluding 0" in line for line in lines)
+
+    def test_who_is_alike_is_no_winner(self, tmp_path: Path) -> None:
+        text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
+        lines = lines_of(replayed(tmp_path, text))
+        assert lines[2].startswith("half and hit knew at the very same times: after ")
+        assert not any("No difference" in line or "cannot be told" in line for line in lines)
+
+    def test_who_knows_at_once_ties(self, tmp_path: Path) -> None:
+        """Of units that surely see both objects at the onset none is the first; of two objects there is no interval."""
+        second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
+        lines = lines_of(replayed(tmp_path, changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second)))
+        assert lines[2] == "half and second knew at once; 2 objects, so no interval. The other 2 are below."
+        assert re.match(
+            r"After it, by differences without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[3]
+        )
+        assert not any("shortest" in line or "soonest" in line for line in lines)
+        three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
+        text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])
+        lines = lines_of(replayed(tmp_path / "all", text))
+        assert lines[2] == "late, half and second knew at once; 2 objects, so no interval."
+        assert not lines[3].startswith("After it")
+
+    def test_the_same_mean_at_other_times_is_a_tie_too(self, tmp_path: Path) -> None:
+        """One unit sees only the one object, the other only the other: at once and never, whichever it is."""
+        pems = "  one: [{when: {range_m: [0, 28]}, detection: {kind: constant, probability: 1.0}}]\n"
+        pems += "  other: [{when: {range_m: [28, 60]}, detection: {kind: constant, probability: 1.0}}]\n"
+        text = changed(
+            ("  blind:", pems + "  blind:"),
+            ("measure: {onset", "measure: {horizon_s: 0.1, onset"),
+            ("pem: half}", "pem: other}"), ("  eye: {", "  near: {on: ego, height_m: 1.8, pem: one}\n  eye: {"),
+            ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [near]}"), ALONE[1], ALONE[3],
+        )  # fmt: skip
+        lines = lines_of(replayed(tmp_path, text))
+        assert lines[2] == (
+            "2 objects, so no interval. hit and half have the same mean time, 0.05 s (never detected counting as 0.1 "
+            "s), though they did not always know at the same time."
+        )
+
+    def test_of_equal_lists_none_is_the_best(self, tmp_path: Path) -> None:
+        """Braking and GOSPA name all that are equal, and say first that means have no interval."""
+        second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
+        blind = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [eye]}")
+        text = changed(ONE, ("  half: {units: [weak]}", "  half: {units: [ego]}"), second, blind)
+        lines = lines_of(replayed(tmp_path, text))
+        [best] = [line for line in lines if line.startswith("The best lists")]
+        assert re.match(
+            r"The best lists, places, misses and false entries taken together, by means without an interval, had half "
+            r"and second: GOSPA 0 m, against \S+ m with late and never\.",
+            best,
+        )
+        [braking] = [line for line in lines if line.startswith("Braking")]
+        assert "pass with half, second, 0 % [" in braking
+        assert "with late, never" in braking
+
+    def test_an_interval_that_includes_0_is_no_difference(self, tmp_path: Path) -> None:
+        """Another unit that lists him every other time, by draws of its own."""
+        other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
+        hit = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}")
+        lines = lines_of(replayed(tmp_path, changed(ONE, other, hit, *ALONE[:2], ALONE[3])))
+        assert re.search(r", but cannot be told from (hit|half)\.$", lines[2])
+        assert re.match(
+            r"No difference to it can be shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3]
+        )
+        assert lines[3].endswith("]). That is not to say that there is none.")
+
+    @pytest.mark.parametrize(
+        ("low", "high", "includes"), [(-1.0, 0.0, True), (0.0, 1.0, True), (-1.0, -1e-3, False), (1e-3, 1.0, False)]
+    )
+    def test_an_interval_that_ends_at_0_includes_it(self, made: Path, low: float, high: float, includes: bool) -> None:
+        study = load_study(made, "GT")
+        assert study.regret is not None
+        table = study.regret.table.copy()
+        mine = (table["metric"] == "ttd_rmst_s") & (table["configuration"] == study.best)
+        table.loc[mine, ["low", "high"]] = [low, high]
+        changed_one = replace(study, regret=replace(study.regret, table=table))
+        (line,) = [line for line in Page(page(changed_one)).lines() if line.startswith("half against GT, the baseline")]
+        assert ("the interval includes 0, so no difference can be shown" in line) == includes
+
+    def test_one_configuration_is_compared_with_nothing(self, tmp_path: Path) -> None:
+        folder = replayed(tmp_path, changed(ONE, *ALONE))
+        found = Page(page(load_study(folder)))
+        lines = found.lines()
+        assert "with the one configuration of perception units" in lines[1]
+        assert lines[2].endswith("There is nothing to compare it with: it is the only configuration.")
+        assert "No differences: there is one configuration only." in found.words
+        assert "regret" not in found.tables
+        assert list(found.tables["summary"]) == ["half"]
+
+    def test_beside_the_truth_alone_nobody_competes(self, tmp_path: Path) -> None:
+        folder = replayed(tmp_path, changed(ONE, *ALONE[1:]))
+        assert lines_of(folder)[2].endswith("There is nothing to compare it with: only the truth stands beside it.")
+        study = load_study(folder)
+        assert (study.baseline, study.best, study.lead) == ("half", "half", None)
+        assert study.regret is not None
+        assert study.regret.configurations == ("GT",)
+
+    def test_nothing_detected_has_no_winner(self, tmp_path: Path) -> None:
+        text = changed(ONE, ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [eye]}"), *ALONE[:1], ALONE[2])
+        text = text.replace("  half: {units: [weak]}", "  half: {units: [eye]}")
+        found = Page(page(load_study(replayed(tmp_path, text))))
+        assert found.lines()[2] == (
+            "Nothing was detected: no configuration came to know of any measured object in any run."
+        )
+        assert not any("soonest" in line or "shortest" in line for line in found.lines())
+        assert "No waterfall: nothing was detected." in found.words
+        assert found.rows["never"][1][:5] == ["drive", "2", "pedestrian", "6 runs (all)", "all 3 configurations"]
+
+    def test_nobody_measured_is_no_answer(self, tmp_path: Path) -> None:
+        folder = replayed(tmp_path, changed((EVERY, "measure: {objects: {classes: [animal]}, onset")))
+        found = Page(page(load_study(folder)))
+        assert found.lines()[2] == "There is no answer: no measured object has an onset, so nobody was measured."
+        assert any(line.startswith("drive: no rows: nothing to measure") for line in found.lines())
+        assert "No differences: nobody was measured." in found.words
+        assert json.loads(found.data) == []
+        assert next(cell.text for cell in found.tables["summary"]["GT"].values()) == "0"
+
+    def test_the_baseline_is_ideal_else_the_first_else_as_asked(self, made: Path, tmp_path: Path) -> None:
+        assert load_study(made).baseline == "late"
+        assert load_study(made, "hit").baseline == "hit"
+        assert "None is named ideal, so this is the first" in page(load_study(made))
+        with pytest.raises(InputError, match="no configuration is named 'hti'"):
+            load_study(made, "hti")
+        named = replayed(tmp_path, changed(ONE, ("  hit:", "  ideal:")))
+        assert load_study(named).baseline == "ideal"
+        assert "Each configuration minus the ideal fusion: the regret." in page(load_study(named))
+
+
+class TestNeverDetected:
+    def test_by_name_and_in_how_many_runs(self, tmp_path: Path) -> None:
+        found = Page(page(load_study(replayed(tmp_path, changed()))))
+        assert found.rows["never"] == [
+            ["log", "object", "class", "never in", "by", "looked at for (s)", "until"],
+            ["drive", "2", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
+            ["drive", "3", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
+        ]
+
+    def test_without_a_draw(self, tmp_path: Path) -> None:
+        """`half` has 46 lists of the one in the way, 14 of which are soon enough; odds of 1 : 1, halved 1 : 2."""
+        exact = (EVERY, "measure: {exact: true, objects: {ids: [2]}, onset")
+        folder = replayed(tmp_path, changed(exact))
+        rows = summary_rows(folder)
+        assert float(rows["half"]["miss_log10"]) == pytest.approx(46 * math.log10(1 / 2))
+        assert float(rows["half"]["miss_per_logit"]) == pytest.approx(-23)
+        assert float(rows["half"]["miss_log10_half_odds"]) == pytest.approx(46 * math.log10(2 / 3))
+        assert float(rows["half"]["fail_share_exact"]) == pytest.approx(2.0**-14)
+        words = Page(page(load_study(folder))).words
+        certain = "the detection of every measured object is certain. The ego fails with probability"
+        assert f"GT: {certain} 0." in words
+        assert f"hit: {certain} 1." in words
+        assert (
+            "half: a measured object is never detected with probability 1.4·10−14; were the odds of every detection "
+            "half of what the PEM says, that would be 7.9·10−9. The ego fails with probability 6.1·10−5."
+        ) in words
+        assert "never: no list ever holds a measured object. The ego fails with probability 1." in words
+
+    def test_nothing_of_it_where_it_was_not_asked_for(self, read: Page) -> None:
+        assert "Without a draw" not in read.words
+
+    @pytest.mark.parametrize(
+        ("log10", "shown"),
+        [
+            (0.0, "1"),
+            (math.log10(0.0123), "0.0123"),
+            (-3.5, "3.2·10<sup>−4</sup>"),
+            (-22.0, "10<sup>−22</sup>"),
+            (-22.000000000000004, "10<sup>−22</sup>"),
+            (math.log10(9.96) - 30, "10<sup>−29</sup>"),
+            (-3630.3010299956640, "5.0·10<sup>−3631</sup>"),
+        ],
+    )
+    def test_numbers_of_any_size(self, log10: float, shown: str) -> None:
+        assert powers(log10) == shown
+
+    def test_counts_runs_by_log_object_and_configuration(self) -> None:
+        rows = pd.DataFrame(
+            [
+                ("a", "1", "A", True), ("a", "1", "A", False), ("a", "1", "A", False),
+                ("a", "1", "B", True), ("a", "1", "B", True), ("a", "1", "B", True),
+                ("b", "1", "A", True), ("b", "1", "A", True), ("b", "1", "A", False),
+            ],
+            columns=["log", "object_id", "configuration", "detected"],
+        ).assign(object_class="car", onset_s=0.0, ended_s=1.0, ended_by="log_end")  # fmt: skip
+        found = misses(rows)[["log", "object_id", "configuration", "missed", "runs"]].to_numpy().tolist()
+        assert found == [["a", "1", "A", 2, 3], ["b", "1", "A", 1, 3]]
+
+
+class TestWaterfall:
+    def test_stages_by_hand(self, read: Page) -> None:
+        cells = read.tables["stages"]
+        shown = {name: {stage: cell.text for stage, cell in row.items()} for name, row in cells.items()}
+        assert shown["late"] == {
+            "detected": "6 of 6", HIDDEN: "0", IN_SIGHT: "0", UNTIL_CAPTURED: "–", TRANSPORT: "0.5", FUSION: "0",
+            "sum": "0.5",
+        }  # fmt: skip
+        assert (shown["GT"][UNTIL_CAPTURED], shown["GT"][HIDDEN], shown["GT"]["sum"]) == ("0", "–", "0")
+        assert (shown["never"]["detected"], shown["never"]["sum"]) == ("0 of 6", "–")
+        assert float(cells["half"][IN_SIGHT].value or "nan") == pytest.approx(float(cells["half"]["sum"].value or 0))
+
+    @staticmethod
+    def rows(**columns: Any) -> pd.DataFrame:
+        """Two rows of one configuration, seconds: the clock starts at 1, captured at 3 and 4, known at 5 and 7."""
+        given = {
+            "detected": [True, True],
+            "onset_s": [1.0, 1.0],
+            "in_sight_s": [2.0, 2.0],
+            "captured_s": [3.0, 4.0],
+            "detection_s": [5.0, 7.0],
+        }
+        return pd.DataFrame(given | columns)
+
+    def stages(self, made: Path, rows: pd.DataFrame, **configuration: Any) -> dict[str, float]:
+        experiment = load_results(made).experiment
+        measure = configuration.pop("measure", {})
+        data = experiment.as_written()
+        data["measure"] |= measure
+        data["configurations"] = {"it": {"units": ["ego", "weak"], **configuration}}
+        return stages(rows, type(experiment).model_validate(data), "it")
+
+    def test_what_arrives_is_known_where_fusion_is_ideal(self, made: Path) -> None:
+        expected = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 2.5, FUSION: 0.0}
+        assert self.stages(made, self.rows()) == expected
+        assert self.stages(made, self.rows(), latency_s={"ego": 1.0, "default": 2.0}) == expected
+
+    def test_latency_is_transport_and_the_rest_fusion(self, made: Path) -> None:
+        gnn = {"fusion": {"kind": "gnn"}}
+        expected = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 1.5, FUSION: 1.0}
+        assert self.stages(made, self.rows(), latency_s=1.5, **gnn) == expected
+        assert self.stages(made, self.rows(), latency_s={"ego": 1.5, "weak": 1.5}, **gnn) == expected
+        confirm = {"confirm": {"hits": 2, "of": 3}}
+        assert self.stages(made, self.rows(), latency_s=1.5, measure=confirm) == expected, "ideal, confirmed"
+
+    def test_what_is_not_known_is_one_stage(self, made: Path) -> None:
+        mixed = {"fusion": {"kind": "gnn"}, "latency_s": {"ego": 1.5, "weak": 1.0}}
+        assert self.stages(made, self.rows(), **mixed) == {HIDDEN: 1.0, IN_SIGHT: 1.5, SINCE_CAPTURED: 2.5}
+        blind = self.rows(in_sight_s=[float("nan")] * 2)
+        assert self.stages(made, blind) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
+        older = self.rows().drop(columns="in_sight_s")
+        assert self.stages(made, older) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
+
+    def test_who_was_listed_while_hidden_was_hidden_until_then(self, made: Path) -> None:
+        found = self.stages(made, self.rows(in_sight_s=[9.0, 2.0]))
+        assert found == {HIDDEN: 1.5, IN_SIGHT: 1.0, TRANSPORT: 2.5, FUSION: 0.0}
+
+    def test_only_the_detected_have_stages(self, made: Path) -> None:
+        nan = float("nan")
+        one = self.rows(detected=[True, False], captured_s=[3.0, nan], detection_s=[5.0, nan])
+        assert self.stages(made, one) == {HIDDEN: 1.0, IN_SIGHT: 1.0, TRANSPORT: 2.0, FUSION: 0.0}
+        assert self.stages(made, self.rows(detected=[False, False])) == {}
+
+    def test_with_count_earlier_there_is_none(self, tmp_path: Path) -> None:
+        folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
+        found = Page(page(load_study(folder)))
+        assert "No waterfall: with count_earlier" in found.words
+        assert "waterfall" not in {figure["id"] for figure in json.loads(found.data)}
+
+
+class TestFigures:
+    def test_plotly_knows_all_that_is_asked_of_it(self, read: Page) -> None:
+        figures = json.loads(read.data)
+        places = [found["id"] for name, found in read.elements if name == "div" and found.get("class") == "plot"]
+        assert places == [figure["id"] for figure in figures]
+        for figure in figures:
+            go.Figure(data=figure["data"], layout=figure["layout"])  # raises where it does not know a key or value
+        assert len(places) == 1 + 5 + 5 + 1, "curves together and one by one, distances, waterfall"
+
+    def test_curves_are_those_of_the_rows(self, read: Page) -> None:
+        curves = next(figure for figure in json.loads(read.data) if figure["id"] == "curves")
+        late = [trace for trace in curves["data"] if trace["meta"] == 1][-1]
+        assert list(zip(late["x"], late["y"], strict=True))[1:-1] == [(0.5, 1.0)]
+        never = [trace for trace in curves["data"] if trace["meta"] == 4][-1]
+        assert set(never["y"]) == {0.0}
+        colours = [trace["line"]["color"] for trace in curves["data"]]
+        for name, look in appearances(NAMES).items():
+            assert rgb(look.colour) in colours, name
+
+    def test_distances_count_every_row_once(self, read: Page) -> None:
+        figures = {figure["id"]: figure for figure in json.loads(read.data)}
+        for k, name in enumerate(NAMES):
+            bars = [trace for trace in figures[f"distances-{k}"]["data"] if trace["type"] == "bar"]
+            shown = {trace["name"]: sum(trace["y"]) for trace in bars}
+            expected = {"hit": {"fails": 1.0}, "never": {}}.get(name, {"passes": 1.0})
+            assert {kind: pytest.approx(share, abs=1e-5) for kind, share in expected.items()} == shown, name
+        (late,) = [trace for trace in figures["distances-1"]["data"] if trace["type"] == "bar"]
+        low, high = late["customdata"][0]
+        assert low <= 20 < high, "known at 1.0 s, when the ego is at 10 m and the pedestrian at 30 m"
+        assert figures["distances-1"]["layout"]["shapes"][0]["x0"] == pytest.approx(20)
+        assert figures["distances-4"]["layout"]["shapes"] == []
+
+    def test_a_foreseen_collision_has_figures_and_verdicts_of_its_own(self, tmp_path: Path) -> None:
+        text = changed(ONE, *ALONE[2:], ("time_s: 0.5}}", "time_s: 0.5}, conflict: {horizon_s: 2.0}}"))
+        text = text.replace("braking: {", "braking: {brakes_for: conflict, ")
+        found = Page(page(load_study(replayed(tmp_path, text))))
+        figures = {figure["id"]: figure for figure in json.loads(found.data)}
+
+        def bars(id_: str) -> set[str]:
+            return {trace["name"] for trace in figures[id_]["data"] if trace["type"] == "bar"}
+
+        assert bars("distances-1") == {"not in conflict"}, "who brakes for the one is not judged at the other"
+        assert bars("foreseen-1") <= {"passes", "fails"}
+        assert bars("foreseen-1")
+        assert "Distance when the collision is foreseen" in found.words
+        assert list(found.tables["conflict"]) == ["GT", "late", "half"]
+
+    def test_sweeps_have_a_figure_each(self, tmp_path: Path) -> None:
+        text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
+        found = Page(page(load_study(replayed(tmp_path, text))))
+        figures = [figure for figure in json.loads(found.data) if figure["id"].startswith("sweep-")]
+        titles = [figure["layout"]["xaxis"]["title"]["text"] for figure in figures]
+        assert titles == ["Latency (s)"] * 3 + ["Rate of the units (lists per second)"] * 3
+        shown = [{trace["name"] for trace in figure["data"]} for figure in figures]
+        assert shown == [{"late (latency swept)"}] * 3 + [{"late", "half"}] * 3, "half has no latency to vary"
+        for figure in figures:
+            go.Figure(data=figure["data"], layout=figure["layout"])
+
+
+class TestFile:
+    def test_the_same_bytes_wherever_the_folder_lies(self, made: Path, mine: Path, tmp_path: Path, html: str) -> None:
+        assert write_report(mine) == mine / "report.html"
+        assert (mine / "report.html").read_text(encoding="utf-8") == html
+        other = tmp_path / "elsewhere" / "other"
+        shutil.copytree(mine, other)
+        (other / "report.html").unlink()
+        deep = write_report(other, tmp_path / "new" / "deep.htm")
+        assert deep.read_bytes() == (mine / "report.html").read_bytes()
+        assert not (other / "report.html").exists()
+        assert str(tmp_path).encode() not in deep.read_bytes()
+
+    def test_nothing_is_fetched(self, read: Page) -> None:
+        for name, found in read.elements:
+            assert name not in ("img", "iframe", "object", "embed", "base", "form"), name
+            for key, value in found.items():
+                assert key not in ("src", "srcset", "action", "style"), (name, key)
+                assert not key.startswith("on"), (name, key)
+                assert key != "href" or value == "data:,", (name, value)
+        (policy,) = [found["content"] for _, found in read.elements if found.get("http-equiv")]
+        assert policy is not None
+        assert policy.startswith("default-src 'none';")
+        assert "http" not in policy
+        style = re.search(r"<style>(.*?)</style>", read.html, re.DOTALL)
+        assert style is not None
+        assert "url(" not in style[1]
+        assert "@import" not in style[1]
+
+    def test_names_are_shown_and_do_nothing(self, tmp_path: Path) -> None:
+        name, log = "<img src=x onerror=alert(1)>\"'&amp;", "<script>alert(2)&'.mcap"
+        text = changed(("logs: [drive.mcap]", f'logs: ["{log}"]'), ("  late:", f"  {json.dumps(name)}:"))
+        text = text.replace("  ego: {on", '  "<b>ego": {on').replace("[ego]", '["<b>ego"]')
+        html = page(load_study(replayed(tmp_path, text, log)))
+        found = Page(html)
+        plain = Page(page(load_study(replayed(tmp_path / "plain", changed()))))
+        assert [tag for tag, _ in found.elements] == [tag for tag, _ in plain.elements]
+        assert [sorted(given) for _, given in found.elements] == [sorted(given) for _, given in plain.elements]
+        assert name in found.tables["summary"]
+        assert found.rows["logs"][1][0] == log.removesuffix(".mcap")
+        assert "<b>ego" in found.words
+        drawn = json.loads(found.data)
+        assert any(trace.get("name") == "&lt;img src=x onerror=alert(1)&gt;\"'&amp;amp;" for trace in drawn[0]["data"])
+        assert "<" not in found.data
+
+    def test_elements_escape_all_but_html(self) -> None:
+        made = tag("td", "a<b>&\"'", Html("<i></i>"), class_='x"y', data_value=None, hidden=True)
+        assert made == '<td class="x&quot;y" hidden>a&lt;b&gt;&amp;&quot;&#x27;<i></i></td>'
+        assert tag("p", "a\nb\x1b\u202e") == "<p>a\\nb\\x1b\\u202e</p>"
+
+    def test_another_summary_is_refused(self, mine: Path) -> None:
+        text = (mine / "summary.csv").read_text(encoding="utf-8")
+        for damaged, said in (
+            (text.replace("ttd_rmst_s,", "ttd_mean_s,"), "expected the column ttd_rmst_s, found none"),
+            (text.replace("pass_share_low", "low"), "expected the column pass_share_low, found none"),
+            (
+                text.replace("\nhit,", "\nhits,"),
+                "expected rows of GT, late, half, hit, never, found GT, late, half, hits",
+            ),
+        ):
+            (mine / "summary.csv").write_text(damaged, encoding="utf-8")
+            with pytest.raises(InputError, match=said):
+                write_report(mine)
+
+    def test_nothing_half_written(self, mine: Path, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("a file")
+        for out in (tmp_path / "report.pdf", tmp_path / "file" / "report.html", mine):
+            with pytest.raises(OutputError):
+                write_report(mine, out)
+        (mine / "detections.parquet").write_bytes(b"PAR1 damaged")
+        with pytest.raises(InputError, match=r"detections.parquet: expected a table that can be read"):
+            write_report(mine)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine"]
+        assert not (mine / "report.html").exists()
+
+
+class TestCommands:
+    def test_run_writes_it_when_asked(self, call: Callable[..., Ended], tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap")
+        experiment, out = tmp_path / "e.yaml", tmp_path / "out"
+        experiment.write_text(changed(ONE), encoding="utf-8")
+        assert call("run", experiment, "--out", out).code == 0
+        assert not (out / "report.html").exists()
+        refused = call("run", experiment, "--out", out, "--report")
+        assert (refused.code, len(refused.lines)) == (2, 1)
+        assert not (out / "report.html").exists()
+        ended = call("run", experiment, "--out", out, "--report", "--overwrite")
+        assert (ended.code, ended.out[-2:]) == (0, [f"results in {out}", f"report in {out / 'report.html'}"])
+        first = (out / "report.html").read_bytes()
+        assert call("report", out).out == [f"report in {out / 'report.html'}"]
+        assert (out / "report.html").read_bytes() == first
+        assert call("run", experiment, "--out", out, "--overwrite").code == 0
+        assert not (out / "report.html").exists(), "a report of other results would be left behind"
+
+    def test_wrong_input_is_one_line(self, call: Callable[..., Ended], mine: Path, tmp_path: Path) -> None:
+        for arguments, said in (
+            ((tmp_path / "none",), "expected a results folder, found no such folder"),
+            ((mine, "--out", tmp_path / "x.csv"), "expected a name that ends with .html or .htm, found x.csv"),
+            ((mine, "--baseline", "nobody"), "--baseline: no configuration is named 'nobody'"),
+        ):
+            ended = call("report", *arguments)
+            assert (ended.code, len(ended.lines), ended.out) == (2, 1, [])
+            assert said in ended.lines[0]

@@ -1,0 +1,351 @@
+"""Comparisons of detections: differences computed in the head, intervals by a plain loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
+from copem_replay.results.compare import Comparison, compare
+from tests.helpers.compare_folders import BRAKING, Row, limits_of, row, write_folder
+
+
+def compared(path: Path, rows: Sequence[Row], **given: Any) -> Comparison:
+    return compare([write_folder(path / "study", rows, **given)])
+
+
+def of(comparison: Comparison, metric: str, log: str = "all") -> Any:
+    """The one row of a metric."""
+    table = comparison.table
+    found = table[(table["metric"] == metric) & (table["log"] == log)]
+    assert len(found) == 1
+    return found.iloc[0]
+
+
+THREE = [
+    row("ideal", 1.0, 30.0),
+    row("ideal", 2.0, 20.0, object_id="8"),
+    row("ideal", None, object_id="9"),
+    row("late", 1.5, 25.0),
+    row("late", None, object_id="8"),
+    row("late", None, object_id="9"),
+]
+"""One object seen half a second later, one no more, one by nobody."""
+
+
+def test_the_share_detected_loses_the_one_that_is_not_seen(tmp_path):
+    share = of(compared(tmp_path, THREE), "detected_share")
+    assert (share["value"], share["baseline_value"]) == pytest.approx((1 / 3, 2 / 3))
+    assert share["difference"] == pytest.approx(-1 / 3)
+    assert share["n"] == 3
+    assert (share["only_configuration"], share["only_baseline"]) == (0, 1)
+    assert share["p_value"] == 1.0
+
+
+def test_never_detected_counts_as_the_horizon(tmp_path):
+    time = of(compared(tmp_path, THREE), "ttd_rmst_s")
+    assert time["value"] == pytest.approx((1.5 + 10 + 10) / 3)
+    assert time["baseline_value"] == pytest.approx((1 + 2 + 10) / 3)
+    assert time["difference"] == pytest.approx((0.5 + 8 + 0) / 3)
+
+
+def test_the_horizon_that_was_given_cuts_all_times(tmp_path):
+    comparison = compared(tmp_path, THREE, measure={"horizon_s": 1.25})
+    assert comparison.horizon_s == 1.25
+    # 1.5 and never are 1.25 now, and so is the baseline's 2.
+    assert of(comparison, "ttd_rmst_s")["difference"] == pytest.approx((0.25 + 0 + 0) / 3)
+
+
+def test_who_was_still_there_is_censored(tmp_path):
+    """Looked at until 4 s: as the other, who is detected at 6 s, for all that is known of later times."""
+    still = {"ended_by": "log_end", "ended_s": 4.0}
+    others = [row(name, 6.0, 30.0, object_id="8") for name in ("ideal", "late")]
+    comparison = compared(tmp_path, [row("ideal", 1.0, 30.0, **still), row("late", None, **still), *others])
+    time = of(comparison, "ttd_rmst_s")
+    assert (time["value"], time["baseline_value"], time["difference"]) == (6.0, 3.5, 2.5)
+    away = [row("ideal", 1.0, 30.0, ended_s=4.0), row("late", None, ended_s=4.0), *others]
+    assert of(compared(tmp_path / "away", away), "ttd_rmst_s")["value"] == 8.0
+
+
+def test_times_count_from_the_onset(tmp_path):
+    rows = [row("ideal", 5.0, 30.0, onset_s=5.0), row("late", 5.5, 30.0, onset_s=5.0)]
+    time = of(compared(tmp_path, rows), "ttd_rmst_s")
+    assert (time["value"], time["baseline_value"]) == (0.5, 0.0)
+
+
+def test_the_median_is_of_the_differences_with_never_below_every_distance(tmp_path):
+    # −5 m, −∞ and 0, where both have nothing: the one in the middle.
+    distance = of(compared(tmp_path, THREE), "dad_median_m")
+    assert distance["difference"] == -5.0
+    assert distance["n"] == 3
+    assert pd.isna(distance["value"])  # 25 m, never, never
+    assert distance["baseline_value"] == 20.0
+
+
+def test_an_infinite_median_is_none(tmp_path):
+    lost = of(compared(tmp_path, [*THREE[:2], *THREE[3:5]]), "dad_median_m")
+    assert pd.isna(lost["difference"])
+    assert lost["n"] == 2
+
+
+def test_detected_where_the_truth_has_a_gap_has_no_distance_to_compare(tmp_path):
+    rows = [*THREE, row("ideal", 1.0, 30.0, object_id="10"), row("late", 1.0, None, object_id="10")]
+    comparison = compared(tmp_path, rows)
+    assert of(comparison, "dad_median_m")["n"] == 3
+    assert of(comparison, "ttd_rmst_s")["n"] == 4
+
+
+def test_pass_share_is_of_those_in_conflict(tmp_path):
+    verdicts = [
+        (True, True, False),
+        (True, True, False),
+        (True, False, False),
+        (True, False, True),
+        (False, True, True),
+    ]
+    rows = [
+        row(name, 1.0, 30.0, object_id=str(k), conflict=conflict, braking_pass=passes if conflict else None)
+        for k, (conflict, *of_sides) in enumerate(verdicts)
+        for name, passes in zip(("ideal", "late"), of_sides, strict=True)
+    ]
+    share = of(compared(tmp_path, rows, braking=BRAKING), "pass_share")
+    assert (share["value"], share["baseline_value"], share["difference"]) == (0.25, 0.5, -0.25)
+    assert share["n"] == 4
+    assert (share["only_configuration"], share["only_baseline"]) == (1, 2)
+    assert share["p_value"] == pytest.approx(binomtest(1, 3).pvalue)
+    assert pd.isna(share["interval_over"])  # four objects are too few
+
+
+def test_without_braking_there_is_no_pass_share(tmp_path):
+    assert "pass_share" not in set(compared(tmp_path, THREE).table["metric"])
+
+
+# ----------------------------------------------------------------------------------------------- intervals
+
+SEED = 5
+
+
+def limits_by_a_loop(clusters: dict[str, list[tuple[float, float]]], seed: int = SEED) -> tuple[float, float]:
+    """Of resamples with as many clusters as there are, the mean of all differences in them."""
+
+    def mean(drawn: list[str]) -> float:
+        pairs = [pair for name in drawn for pair in clusters[name]]
+        return float(np.mean([first for first, _ in pairs]) - np.mean([second for _, second in pairs]))
+
+    return limits_of(list(clusters), mean, seed)
+
+
+def pairs_of(times: Sequence[tuple[float, float]], **where: Any) -> list[Row]:
+    """Run after run, detected by `late` and by `ideal`."""
+    return [
+        row(name, time, 30.0 - time, run=run, **where)
+        for run, both in enumerate(times)
+        for name, time in zip(("late", "ideal"), both, strict=True)
+    ]
+
+
+def test_objects_are_resampled_whole(tmp_path):
+    rng = np.random.default_rng(7)
+    of_objects = {str(k): [(float(a) + k, float(b)) for a, b in rng.uniform(0, 2, (3, 2))] for k in range(6)}
+    rows = [r for name, times in of_objects.items() for r in pairs_of(times, object_id=name)]
+    time = of(compared(tmp_path, rows, seed=SEED), "ttd_rmst_s")
+    expected = limits_by_a_loop({f"a\n{name}": times for name, times in of_objects.items()})
+    assert time["interval_over"] == "objects"
+    assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_five_logs_are_resampled_whole_and_each_by_what_it_has(tmp_path):
+    rng = np.random.default_rng(8)
+    of_logs = {f"log{k}": [(float(a) + k, float(b)) for a, b in rng.uniform(0, 2, (6, 2))] for k in range(5)}
+    rows = [r for name, times in of_logs.items() for r in pairs_of(times, log=name)]
+    comparison = compared(tmp_path, rows, seed=SEED)
+    time = of(comparison, "ttd_rmst_s")
+    assert time["interval_over"] == "logs"
+    assert (time["low"], time["high"]) == pytest.approx(limits_by_a_loop(of_logs), abs=1e-8)
+    one = of(comparison, "ttd_rmst_s", "log3")
+    times = of_logs["log3"]
+    assert one["interval_over"] == "runs"
+    assert one["difference"] == pytest.approx(np.mean([a - b for a, b in times]), abs=1e-8)
+    expected = limits_by_a_loop({str(run): [both] for run, both in enumerate(times)})
+    assert (one["low"], one["high"]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_the_median_is_resampled_too(tmp_path):
+    # Of six objects three are 1 m and three 2 m nearer: the limits are these, and no mean of any.
+    rows = [r for k in range(6) for r in pairs_of([(1.0 + k % 2, 0.0)], object_id=str(k))]
+    distance = of(compared(tmp_path, rows), "dad_median_m")
+    assert (distance["difference"], distance["low"], distance["high"]) == (-2.0, -2.0, -1.0)
+
+
+def test_shares_that_differ_alike_in_five_objects_have_exact_limits(tmp_path):
+    """1 − 0.025^(1/5) = 0.521824; late never detects what the other does, then both detect the same."""
+    for late, expected in ((None, (-1.0, -0.478176)), (1.0, (-0.521824, 0.521824))):
+        rows = [r for k in range(5) for r in (row("ideal", 1.0, 30.0, object_id=str(k)),
+                                              row("late", late, late, object_id=str(k)))]  # fmt: skip
+        share = of(compared(tmp_path / str(late), rows), "detected_share")
+        assert (share["low"], share["high"]) == pytest.approx(expected, abs=1e-6)
+        assert (share["interval"], share["interval_over"]) == ("exact", "objects")
+
+
+def test_exact_limits_go_by_the_rows_of_each_object(tmp_path):
+    """One object in 20 runs, four in one each: n = 24² / (20² + 4) clusters."""
+    rows = [row(name, 1.0, 30.0, object_id="0", run=run) for run in range(20) for name in ("ideal", "late")]
+    rows += [row(name, 1.0, 30.0, object_id=str(k)) for k in range(1, 5) for name in ("ideal", "late")]
+    share = of(compared(tmp_path, rows), "detected_share")
+    limit = 1 - 0.025 ** (404 / 576)
+    assert (share["low"], share["high"]) == pytest.approx((-limit, limit))
+
+
+def test_means_that_are_all_alike_have_no_interval_and_one_that_is_not_brings_it_back(tmp_path):
+    rows = [r for k in range(9) for r in pairs_of([(1.5, 1.0), (2.5, 2.0)], object_id=str(k))]
+    time = of(compared(tmp_path / "alike", rows), "ttd_rmst_s")
+    assert time["difference"] == 0.5
+    assert time["interval"] == "all clusters alike"
+    assert time[["low", "high", "interval_over"]].isna().all()
+    time = of(compared(tmp_path / "other", [*rows, *pairs_of([(1.75, 1.0)], object_id="9")]), "ttd_rmst_s")
+    assert (time["interval"], time["interval_over"]) == ("bootstrap", "objects")
+    assert 0.5 <= time["low"] < time["high"] < 0.75
+
+
+def test_a_median_that_no_resample_moves_keeps_its_interval_where_clusters_differ(tmp_path):
+    rows = [r for k in range(20) for r in pairs_of([(1.0 + (k == 3), 1.0)], object_id=str(k))]
+    distance = of(compared(tmp_path, rows), "dad_median_m")
+    assert (distance["low"], distance["high"], distance["interval"]) == (0.0, 0.0, "bootstrap")
+
+
+def test_few_objects_have_no_interval_and_that_is_said(tmp_path):
+    comparison = compared(tmp_path, [r for k in range(4) for r in pairs_of([(1.0, 0.0)] * 50, object_id=str(k))])
+    assert comparison.table["low"].isna().all()
+    assert comparison.table["interval_over"].isna().all()
+    assert any("no interval of detected_share, ttd_rmst_s, dad_median_m" in note for note in comparison.notes)
+
+
+def test_a_single_run_of_a_single_object_has_no_interval(tmp_path):
+    assert pd.isna(of(compared(tmp_path, pairs_of([(1.0, 0.0)])), "ttd_rmst_s")["interval_over"])
+
+
+# --------------------------------------------------------------------------------------------------- always
+
+RANDOM = np.random.default_rng(11)
+
+
+def random_rows(names: Sequence[str], logs: int = 2) -> list[Row]:
+    rows = []
+    for log in range(logs):
+        for name in names:
+            for k in range(4):
+                for run in range(3):
+                    time = None if RANDOM.random() < 0.3 else float(RANDOM.uniform(0, 10))
+                    verdict = {"conflict": k < 3, "braking_pass": bool(RANDOM.random() < 0.5)}
+                    where = {"log": f"log{log}", "object_id": str(k), "run": run}
+                    rows.append(row(name, time, None if time is None else 50 - time, **where, **verdict))
+    return rows
+
+
+def test_a_difference_of_means_is_the_difference_of_the_values(tmp_path):
+    table = compared(tmp_path, random_rows(["ideal", "b", "c"]), braking=BRAKING).table
+    means = table[table["metric"].isin(["detected_share", "ttd_rmst_s", "pass_share"])]
+    assert set(means["log"]) == {"all", "log0", "log1"}
+    assert len(means) == 3 * 2 * 3
+    assert (means["value"] - means["baseline_value"]).tolist() == means["difference"].tolist()
+
+
+def test_means_of_all_logs_are_those_of_the_logs_by_their_rows(tmp_path):
+    table = compared(tmp_path, random_rows(["ideal", "b"], logs=3)).table
+    times = table[table["metric"] == "ttd_rmst_s"].set_index("log")
+    weighted = times["difference"] * times["n"]
+    assert weighted.drop("all").sum() == pytest.approx(weighted["all"])
+
+
+def test_the_same_rows_in_another_folder_differ_in_nothing(tmp_path):
+    rows = [r | {"configuration": "x"} for r in random_rows(["x"])]
+    folders = [write_folder(tmp_path / name, rows, braking=BRAKING) for name in ("first", "second")]
+    table = compare(folders, baseline="first:x").table
+    assert set(table["metric"]) == {"detected_share", "ttd_rmst_s", "dad_median_m", "pass_share"}
+    assert (table["difference"] == 0.0).all()
+    table = table[table["log"] == "all"].set_index("metric")
+    # None of eight clusters differs, and of the six in conflict none: 1 − 0.025^(1/8), 1 − 0.025^(1/6).
+    for metric, limit in (("detected_share", 0.369417), ("pass_share", 0.459258)):
+        assert tuple(table.loc[metric, ["low", "high"]]) == pytest.approx((-limit, limit), abs=1e-6)
+        assert table.loc[metric, "interval"] == "exact"
+    others = table.loc[["ttd_rmst_s", "dad_median_m"]]
+    assert (others["interval"] == "all clusters alike").all()
+    assert others[["low", "high", "interval_over"]].isna().all(axis=None)
+
+
+def test_the_order_of_rows_does_not_matter(tmp_path):
+    rows = random_rows(["ideal", "b"])
+    straight = compared(tmp_path, rows, braking=BRAKING).table
+    others = [rows[k] for k in np.random.default_rng(1).permutation(len(rows))]
+    logs = {"log0": "content of log0", "log1": "content of log1"}
+    shuffled = compared(tmp_path / "shuffled", others, braking=BRAKING, logs=logs).table
+    numbers = ["value", "baseline_value", "difference", "low", "high"]
+    assert shuffled[numbers].to_numpy() == pytest.approx(straight[numbers].to_numpy(), nan_ok=True)
+    assert shuffled["metric"].tolist() == straight["metric"].tolist()
+
+
+def test_rows_are_in_the_order_of_logs_configurations_and_metrics(tmp_path):
+    table = compared(tmp_path, random_rows(["ideal", "z", "b"])).table
+    assert table["log"].drop_duplicates().tolist() == ["all", "log0", "log1"]
+    assert table["configuration"].drop_duplicates().tolist() == ["z", "b"]
+    assert table["metric"].tolist() == ["detected_share", "ttd_rmst_s", "dad_median_m"] * 6
+    assert (table["baseline"] == "ideal").all()
+
+
+def test_censored_times_are_estimated_as_in_the_summary_and_in_every_resample(tmp_path):
+    """Each resample by itself: its rows, as often as they are drawn, through the estimator of one sample."""
+    rng = np.random.default_rng(12)
+    rows, sides = [], {"late": {}, "ideal": {}}
+    endings = {"log_end": CENSORED, "ego_left": CENSORED, "object_left": LEFT}
+    for k in range(6):
+        until, ended_by = float(rng.choice([3.0, 5.0, 7.0])), str(rng.choice(list(endings)))
+        for run in range(4):
+            for name in sides:
+                at = round(float(rng.uniform(0, 8)), 3)
+                known = at <= until
+                rows.append(
+                    row(name, at if known else None, 5.0 if known else None, object_id=str(k), run=run,
+                        ended_s=until, ended_by=ended_by)
+                )  # fmt: skip
+                sides[name].setdefault(f"a\n{k}", []).append((at, DETECTED) if known else (until, endings[ended_by]))
+    time = of(compared(tmp_path, rows, seed=SEED), "ttd_rmst_s")
+
+    def mean(name: str, drawn: Sequence[str]) -> float:
+        times = [pair for key in drawn for pair in sides[name][key]]
+        found = cumulative_incidence(np.array([t for t, _ in times]), np.array([e for _, e in times]))
+        return restricted_mean(*found, 10.0)
+
+    keys = sorted(sides["ideal"])
+    assert time["value"] == pytest.approx(mean("late", keys))
+    assert time["baseline_value"] == pytest.approx(mean("ideal", keys))
+    expected = limits_of(keys, lambda drawn: mean("late", drawn) - mean("ideal", drawn), SEED)
+    assert (time["low"], time["high"]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_all_metrics_of_a_pair_are_resampled_alike_or_not_at_all(tmp_path):
+    """Six logs, of which four have a distance: that is too few of them, not an occasion to resample objects."""
+    rows = [
+        row(name, time if k < 4 or name == "ideal" else None, 9.0 if k < 4 or name == "ideal" else None, log=f"log{k}")
+        for k in range(6)
+        for name, time in (("ideal", 1.0), ("late", 2.0))
+    ]
+    rows += [row(name, 1.0, None, log="log5", object_id="8") for name in ("ideal", "late")]
+    comparison = compared(tmp_path, rows)
+    assert of(comparison, "ttd_rmst_s")["interval_over"] == "logs"
+    assert set(comparison.table[comparison.table["log"] == "all"]["interval_over"].dropna()) == {"logs"}
+
+
+def test_of_a_detection_and_a_censoring_at_one_time_the_detection_comes_first(tmp_path):
+    """Both after 0.2 s: of two who are looked at then one is detected. 1 − 0.8 is less than that by a rounding."""
+    assert 1 - 0.8 < 0.2
+    censored = {"onset_s": 0.8, "ended_s": 1.0, "ended_by": "log_end"}
+    rows = [row("ideal", 0.2, 30.0), row("late", 0.2, 30.0)]
+    rows += [row(name, None, object_id="8", **censored) for name in ("ideal", "late")]
+    time = of(compared(tmp_path, rows, measure={"horizon_s": 1.0}), "ttd_rmst_s")
+    assert time["value"] == pytest.approx(0.2 + 0.5 * 0.8)

@@ -1,0 +1,134 @@
+"""Statistics of pairs against SciPy, NumPy and plain loops."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from copem_replay.metrics.intervals import Resamples, multiplicities, percentile_limits
+from copem_replay.metrics.survival import quantile_with_never
+from copem_replay.results.compare.paired_statistics import mcnemar, resampled_medians, resampled_sums
+from tests.helpers.compare_folders import widened
+
+counts = st.integers(0, 400)
+
+
+@given(counts, counts)
+def test_mcnemar_is_the_exact_binomial_test_of_the_discordant_pairs(only_first, only_second):
+    n = only_first + only_second
+    expected = binomtest(only_first, n).pvalue if n else 1.0
+    assert mcnemar(only_first, only_second) == pytest.approx(expected, rel=1e-9)
+
+
+def test_mcnemar_by_hand():
+    # Of 6 discordant pairs 1 is the other way: 2 · (1 + 6) / 64.
+    assert mcnemar(1, 5) == pytest.approx(14 / 64)
+    assert mcnemar(5, 1) == mcnemar(1, 5)
+    assert mcnemar(3, 3) == 1.0
+    assert mcnemar(0, 0) == 1.0
+
+
+def test_mcnemar_of_less_than_nothing_is_refused():
+    with pytest.raises(ValueError, match="at least 0"):
+        mcnemar(-1, 2)
+
+
+def test_each_number_draws_its_cluster():
+    drawn = multiplicities(np.array([[0.1, 0.9, 0.5], [0.1, 0.2, 0.3], [0.99, 0.7, 0.34]]))
+    assert drawn.tolist() == [[1, 1, 1], [3, 0, 0], [0, 1, 2]]
+
+
+def test_resamples_are_as_large_as_the_sample_whatever_their_number():
+    uniform = np.random.default_rng(3).uniform(1e-9, 1, (5000, 1000))  # more than is held at a time
+    drawn = multiplicities(uniform)
+    assert (drawn.sum(axis=1) == 1000).all()
+    assert drawn[4999].tolist() == np.bincount((uniform[4999] * 1000).astype(int), minlength=1000).tolist()
+
+
+@pytest.mark.parametrize("uniform", [np.zeros((2, 0)), np.array([[0.0, 0.5]]), np.array([[0.5, 1.0]]), np.array([0.5])])
+def test_draws_of_other_numbers_are_refused(uniform):
+    with pytest.raises(ValueError, match="multiplicities"):
+        multiplicities(uniform)
+
+
+def test_sums_of_resamples_are_those_of_a_plain_loop():
+    rng = np.random.default_rng(1)
+    sums, count = rng.normal(size=(7, 3)), rng.integers(0, 4, (50, 7)).astype(np.uint32)
+    expected = [[sum(int(c) * sums[k, j] for k, c in enumerate(row)) for j in range(3)] for row in count]
+    assert resampled_sums(sums, count) == pytest.approx(np.array(expected))
+
+
+def test_equal_columns_have_equal_sums_to_the_last_bit():
+    rng = np.random.default_rng(2)
+    column = rng.normal(size=301)
+    sums = np.stack([column, rng.normal(size=301), column, np.ones(301), column], axis=1)
+    result = resampled_sums(sums, rng.integers(0, 9, (97, 301)).astype(np.uint32))
+    assert (result[:, 0] == result[:, 2]).all()
+    assert (result[:, 0] == result[:, 4]).all()
+
+
+def test_counts_of_other_clusters_are_refused():
+    count = np.ones((4, 3), dtype=np.uint32)
+    with pytest.raises(ValueError, match="2 clusters"):
+        resampled_sums(np.ones((2, 1)), count)
+    with pytest.raises(ValueError, match="4 clusters"):
+        resampled_medians(np.ones(2), np.array([0, 3]), count)
+
+
+numbers = st.integers(-3, 3).map(float) | st.sampled_from([-math.inf, math.inf])
+rows = st.lists(st.tuples(numbers, st.integers(0, 3)), max_size=12)
+
+
+@given(rows, st.lists(st.lists(st.integers(0, 3), min_size=4, max_size=4), min_size=1, max_size=5))
+def test_medians_of_resamples_are_those_of_the_rows_written_out(items, count):
+    values, cluster = (np.array([item[k] for item in items], dtype=kind) for k, kind in ((0, float), (1, np.int64)))
+    found = resampled_medians(values, cluster, np.array(count, dtype=np.uint32))
+    for median, multiplicity in zip(found, count, strict=True):
+        written_out = np.repeat(values, [multiplicity[c] for c in cluster])
+        if not len(written_out):
+            assert math.isnan(median)
+        else:
+            assert median == sorted(written_out)[(len(written_out) - 1) // 2]
+
+
+def test_medians_are_those_of_statistics_with_weights():
+    rng = np.random.default_rng(5)
+    values, cluster = rng.normal(size=1000), rng.integers(0, 20, 1000)
+    count = rng.integers(0, 3, (30, 20)).astype(np.uint32)
+    expected = [
+        quantile_with_never(values, np.ones(1000, dtype=bool), 0.5, row[cluster].astype(float)) for row in count
+    ]
+    assert resampled_medians(values, cluster, count).tolist() == expected
+
+
+def limits(values, clusters, confidence=0.95):
+    """Of figures of so many resamples, each drawn once."""
+    drawn = Resamples(np.ones((len(values), clusters), dtype=np.uint32), np.ones(len(values), dtype=np.int64))
+    return percentile_limits(np.array(values), drawn, confidence=confidence)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.integers(2, 200), st.floats(0.5, 0.99))
+def test_limits_are_quantiles_linear_between_neighbours(values, clusters, confidence):
+    expected = np.quantile(values, widened(clusters, confidence))
+    found = limits(values, clusters, confidence)
+    assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
+
+
+def test_what_resamples_do_not_have_is_left_out_of_the_limits():
+    assert limits([math.nan, 2.0, math.nan], 5) == (2.0, 2.0)
+    assert all(math.isnan(limit) for limit in limits([math.nan], 5))
+
+
+def test_limits_among_infinite_figures_are_infinite():
+    low, high = limits([-math.inf] * 10 + [1.0] * 90, 50)
+    assert (low, high) == (-math.inf, 1.0)
+    # Between one and the other infinity there is no number.
+    assert math.isnan(limits([-math.inf, math.inf], 50, 0.5)[0])
+
+
+def test_a_confidence_of_one_is_refused():
+    with pytest.raises(ValueError, match="confidence"):
+        limits([1.0] * 3, 5, 1.0)

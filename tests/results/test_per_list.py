@@ -1,0 +1,361 @@
+"""Comparisons of what the fused lists hold: errors, GOSPA, ghosts, and times at equal ghosts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from copem_replay.results.compare import Comparison, compare
+from copem_replay.results.compare import per_list as lists_module
+from tests.helpers.compare_folders import Row, ghosts, limits_of, row, seen, step, write_folder
+
+FOUR = [None] * 4
+
+
+def compared(path: Path, rows: Sequence[Row], *, ghosts_per_min: float | None = None, **given: Any) -> Comparison:
+    return compare([write_folder(path / "study", rows, **given)], ghosts_per_min=ghosts_per_min)
+
+
+def of(comparison: Comparison, metric: str) -> Any:
+    table = comparison.table
+    found = table[(table["metric"] == metric) & (table["log"] == "all")]
+    assert len(found) == 1
+    return found.iloc[0]
+
+
+# ------------------------------------------------------------------------------------------------- errors
+
+
+def test_errors_are_compared_where_both_match(tmp_path):
+    rows = [seen("ideal", [0, 1, None, 2], FOUR), seen("late", [3, None, 1, 4], FOUR)]
+    error = of(compared(tmp_path, rows), "position_rmse_m")
+    assert error["n"] == 2
+    assert error["value"] == pytest.approx(math.sqrt((9 + 16) / 2))
+    assert error["baseline_value"] == pytest.approx(math.sqrt(4 / 2))
+    assert error["difference"] == pytest.approx(math.sqrt(12.5) - math.sqrt(2))
+
+
+def test_lists_are_paired_by_instant_whatever_their_number(tmp_path):
+    # Of the late lists the first two are at 1 s and 2 s, to half a microsecond; the third is at an instant of its own.
+    instants = {"late": [1.0000005, 2.0, 2.5]}
+    rows = [seen("ideal", [9, 1, 2, 9], FOUR), seen("late", [3, 4, 100], FOUR[:3])]
+    error = of(compared(tmp_path, rows, available_s=instants), "position_rmse_m")
+    assert error["n"] == 2
+    assert error["value"] == pytest.approx(math.sqrt((9 + 16) / 2))
+    assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
+
+
+def test_lists_begin_where_the_objects_stay_does(tmp_path):
+    rows = [seen("ideal", [1, 2], FOUR[:2], first_list=1), seen("late", [3, 5, 7], FOUR[:3])]
+    error = of(compared(tmp_path, rows), "position_rmse_m")  # the instants 1 s and 2 s
+    assert error["value"] == pytest.approx(math.sqrt((25 + 49) / 2))
+    assert error["baseline_value"] == pytest.approx(math.sqrt((1 + 4) / 2))
+    back = compare([tmp_path / "study"], baseline="late")
+    assert of(back, "position_rmse_m")["difference"] == pytest.approx(-error["difference"])
+
+
+def test_without_a_common_instant_there_is_nothing_to_compare(tmp_path):
+    rows = [seen("ideal", [1, 1, 1, 1], [1, 1, 1, 1]), seen("late", [1, 1], [1, 1])]
+    comparison = compared(tmp_path, rows, available_s={"late": [1.000003, 1.5]})
+    for metric in ("position_rmse_m", "gospa_m"):
+        assert of(comparison, metric)["n"] == 0
+        assert pd.isna(of(comparison, metric)["difference"])
+
+
+def test_errors_of_objects_are_resampled_whole(tmp_path):
+    rng = np.random.default_rng(3)
+    errors = {str(k): rng.uniform(0, 2 + k, (2, 4)).astype(np.float32) for k in range(5)}
+    rows = [
+        seen(name, [float(e) for e in errors[key][side]], FOUR, object_id=key)
+        for key in errors
+        for side, name in enumerate(("late", "ideal"))
+    ]
+    error = of(compared(tmp_path, rows), "position_rmse_m")
+
+    def regret(drawn: list[str]) -> float:
+        both = np.concatenate([errors[key[2:]] for key in drawn], axis=1).astype(float)
+        first, second = np.sqrt((both**2).mean(axis=1))
+        return float(first - second)
+
+    assert (error["interval"], error["interval_over"]) == ("bootstrap", "objects")
+    expected = limits_of([f"a\n{key}" for key in errors], regret)
+    assert (error["low"], error["high"]) == pytest.approx(expected, abs=1e-8)
+
+
+# -------------------------------------------------------------------------------------------------- GOSPA
+
+
+def two_objects() -> list[Row]:
+    return [
+        seen("ideal", FOUR, [1, 1, 1, 1]),
+        seen("ideal", FOUR, [None, None, 3, 3], object_id="8"),
+        seen("late", FOUR, [4, 4, 4, 4]),
+        seen("late", FOUR, [None, None, 0, 0], object_id="8"),
+    ]
+
+
+def test_gospa_is_the_root_of_the_mean_over_lists_of_the_sum_over_objects(tmp_path):
+    gospa = of(compared(tmp_path, two_objects()), "gospa_m")
+    assert gospa["n"] == 4
+    assert gospa["value"] == pytest.approx(math.sqrt(16 / 4))
+    assert gospa["baseline_value"] == pytest.approx(math.sqrt(10 / 4))
+    assert gospa["difference"] == pytest.approx(2 - math.sqrt(2.5))
+
+
+def test_gospa_has_the_power_of_the_experiment(tmp_path):
+    of_power = {"gospa": {"cutoff_m": 2.0, "power": 1.0}}
+    assert of(compared(tmp_path, two_objects(), measure=of_power), "gospa_m")["difference"] == 4.0 - 2.5
+
+
+def test_lists_in_which_nobody_is_measured_do_not_count(tmp_path):
+    rows = [seen(name, FOUR, [None, None, part, part]) for name, part in (("ideal", 1), ("late", 9))]
+    gospa = of(compared(tmp_path, rows), "gospa_m")
+    assert (gospa["value"], gospa["baseline_value"], gospa["n"]) == (3.0, 1.0, 2)
+
+
+def test_an_object_that_no_list_is_measured_by_is_none_to_resample(tmp_path):
+    rows = [
+        seen(name, FOUR, [1.0 if k < 4 else None] * 4, object_id=str(k)) for k in range(5) for name in ("ideal", "late")
+    ]
+    comparison = compared(tmp_path, rows)
+    assert of(comparison, "detected_share")["interval_over"] == "objects"
+    assert pd.isna(of(comparison, "gospa_m")["interval_over"])
+
+
+def test_each_run_has_its_lists(tmp_path):
+    rows = [
+        seen(name, FOUR[:2], [part + run] * 2, run=run) for name, part in (("ideal", 1), ("late", 4)) for run in (0, 1)
+    ]
+    gospa = of(compared(tmp_path, rows), "gospa_m")
+    assert gospa["n"] == 4
+    assert gospa["difference"] == pytest.approx(math.sqrt(4.5) - math.sqrt(1.5))
+
+
+def test_resampled_objects_leave_the_number_of_lists_as_it_is(tmp_path):
+    parts = {str(k): (float(k), 1.0) for k in range(5)}
+    rows = [
+        seen(name, FOUR, [parts[key][side]] * 4, object_id=key)
+        for key in parts
+        for side, name in enumerate(("late", "ideal"))
+    ]
+    gospa = of(compared(tmp_path, rows), "gospa_m")
+    # Every list has all objects: its sum is that of those drawn.
+
+    def regret(drawn: list[str]) -> float:
+        some = [parts[key[2:]] for key in drawn]
+        return math.sqrt(sum(a for a, _ in some)) - math.sqrt(sum(b for _, b in some))
+
+    expected = limits_of([f"a\n{key}" for key in parts], regret)
+    assert gospa["difference"] == pytest.approx(math.sqrt(10) - math.sqrt(5))
+    assert (gospa["low"], gospa["high"]) == pytest.approx(expected, abs=1e-8)
+
+
+def test_lists_are_paired_part_by_part_as_well_as_at_once(tmp_path, monkeypatch):
+    rng = np.random.default_rng(4)
+    rows = [
+        seen(
+            name, [float(e) if e > 0.5 else None for e in rng.uniform(0, 3, 4)], [1.0, 2.0, 3.0, 4.0], object_id=str(k)
+        )
+        for k in range(7)
+        for name in ("ideal", "late")
+    ]
+    whole = compared(tmp_path, rows).table
+    monkeypatch.setattr(lists_module, "_VALUES", 5)
+    assert compare([tmp_path / "study"]).table.equals(whole)
+
+
+# ------------------------------------------------------------------------------------------------- ghosts
+
+
+def test_ghosts_per_minute_are_of_all_minutes(tmp_path):
+    rows = [row(name, 1.0, 30.0, run=run) for name in ("ideal", "late") for run in (0, 1)]
+    half = {"minutes": 0.5}
+    lists = [
+        ghosts("ideal", 1, **half), ghosts("ideal", 1, run=1, **half),
+        ghosts("late", 3, **half), ghosts("late", 5, run=1, **half),
+    ]  # fmt: skip
+    rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
+    assert (rate["value"], rate["baseline_value"], rate["difference"], rate["n"]) == (8.0, 2.0, 6.0, 2)
+    assert pd.isna(rate["interval_over"])
+
+
+def test_ghosts_go_with_the_object_that_is_nearest_and_the_others_stay(tmp_path):
+    nearest = {str(k): k for k in range(5)}  # ten of them; three more are near nobody
+    rows = [
+        seen(name, FOUR, FOUR, object_id=key, ghosts=near if name == "late" else 0)
+        for key, near in nearest.items()
+        for name in ("ideal", "late")
+    ]
+    rate = of(compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)]), "ghosts_per_min")
+    expected = limits_of([f"a\n{key}" for key in nearest], lambda drawn: 3 + sum(nearest[key[2:]] for key in drawn))
+    assert rate["difference"] == 13.0
+    assert rate["interval_over"] == "objects"
+    assert (rate["low"], rate["high"]) == pytest.approx(expected)
+
+
+def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(tmp_path):
+    rows = [row(name, 1.0, 30.0, object_id=str(k)) for name in ("ideal", "late") for k in range(5)]
+    comparison = compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)])
+    assert of(comparison, "detected_share")["interval_over"] == "objects"
+    assert pd.isna(of(comparison, "ghosts_per_min")["interval_over"])
+    assert [note for note in comparison.notes if note.startswith("no interval")] == [
+        "no interval of ghosts_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+    ]
+
+
+def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
+    counts = [0, 2, 4, 6, 8]
+    rows = [row(name, 1.0, 30.0, run=run) for name in ("ideal", "late") for run in range(5)]
+    lists = [ghosts("late", n, run=run) for run, n in enumerate(counts)]
+    lists += [ghosts("ideal", 1, run=run) for run in range(5)]
+    rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
+    expected = limits_of(
+        [str(k) for k in range(5)], lambda drawn: float(np.mean([counts[int(run)] for run in drawn])) - 1
+    )
+    assert (rate["difference"], rate["interval_over"]) == (3.0, "runs")
+    assert (rate["low"], rate["high"]) == pytest.approx(expected)
+
+
+# -------------------------------------------------------------------------------------- at equal ghosts
+
+LISTS = [ghosts("ideal", 0), ghosts("late", 6, existence=[0.0, 0.5, 0.9], ghosts_at=[6, 2, 0])]
+STEPS = [step("ideal", 1.0, 0.5), step("late", 0.4, 1.0), step("late", 0.7, 3.0)]
+
+
+def at_equal_ghosts(path: Path, per_min: float | None, *, lists: Sequence[Row] = LISTS, **of_late: Any) -> Comparison:
+    rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0, **of_late)]
+    return compared(path, rows, lists=lists, steps=STEPS, ghosts_per_min=per_min)
+
+
+@pytest.mark.parametrize(
+    ("per_min", "existence", "time_s", "kept"),
+    [
+        (6, 0.0, 1.0, 6),
+        (9, 0.0, 1.0, 6),  # there are no more
+        (5, 0.0, 0.75 * 1.0 + 0.25 * 3.0, 5),  # (5 − 2) / (6 − 2) of the drives with 6 a minute, the rest with 2
+        (2, 0.5, 3.0, 2),
+        (0.5, 0.5, 0.25 * 3.0 + 0.75 * 10.0, 0.5),
+        (0, 0.9, 10.0, 0),
+    ],
+)
+def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_s, kept):
+    comparison = at_equal_ghosts(tmp_path, per_min)
+    time = of(comparison, "ttd_rmst_s_equal_ghosts")
+    assert time["existence"] == existence
+    assert time["baseline_existence"] == 0.0
+    assert (time["ghosts_kept_per_min"], time["baseline_ghosts_kept_per_min"]) == (kept, 0)
+    assert (time["value"], time["baseline_value"], time["difference"]) == (time_s, 0.5, time_s - 0.5)
+    said = [note for note in comparison.notes if "ghosts per minute only" in note]
+    assert [note for note in said if note.startswith("late")] == (
+        ["late: all its entries make 6 ghosts per minute only: its ttd_rmst_s_equal_ghosts is at that"]
+        if kept < per_min
+        else []
+    )
+
+
+def test_the_rate_is_the_baselines_own_unless_given(tmp_path):
+    comparison = at_equal_ghosts(tmp_path, None)
+    assert comparison.ghosts_per_min == 0.0
+    assert of(comparison, "ttd_rmst_s_equal_ghosts")["existence"] == 0.9
+    back = compare([tmp_path / "study"], baseline="late")
+    assert back.ghosts_per_min == 6.0
+    assert of(back, "ttd_rmst_s_equal_ghosts")["difference"] == -0.5
+
+
+def test_an_entry_at_the_threshold_is_not_left_out(tmp_path):
+    lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.7], ghosts_at=[6, 2])]
+    assert of(at_equal_ghosts(tmp_path, 2, lists=lists), "ttd_rmst_s_equal_ghosts")["value"] == 3.0
+
+
+def test_who_is_no_longer_detected_is_censored_as_in_any_other_mean(tmp_path):
+    still = {"ended_by": "log_end", "ended_s": 7.0}
+    assert of(at_equal_ghosts(tmp_path, 0, **still), "ttd_rmst_s_equal_ghosts")["value"] == 10.0
+
+
+def test_where_no_threshold_is_clean_enough_nothing_is_listed_in_some_drives(tmp_path):
+    lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.5], ghosts_at=[6, 2])]
+    time = of(at_equal_ghosts(tmp_path, 1, lists=lists), "ttd_rmst_s_equal_ghosts")
+    assert (time["existence"], time["ghosts_kept_per_min"]) == (0.5, 1)
+    assert time["value"] == 0.5 * 3.0 + 0.5 * 10.0  # half of the drives at 2 a minute, in half of them nothing
+
+
+def test_the_threshold_is_that_of_all_logs_in_each_of_them(tmp_path):
+    rows = [row(name, 1.0, 30.0, log=log) for name in ("ideal", "late") for log in ("a", "b")]
+    steps = [step(name, 1.0, 1.0, log=log) for name in ("ideal", "late") for log in ("a", "b")]
+    lists = [ghosts("ideal", 2, log=log) for log in ("a", "b")]
+    lists += [
+        ghosts("late", n, log=log, existence=[0.0, 0.5, 0.8], ghosts_at=[n, at, 0])
+        for log, n, at in (("a", 9, 4), ("b", 1, 0))
+    ]
+    table = compared(tmp_path, rows, lists=lists, steps=steps).table
+    times = table[table["metric"] == "ttd_rmst_s_equal_ghosts"]
+    # 2 a minute of both logs: 4 of `a` and none of `b`, though one log alone has more and the other fewer.
+    assert times["existence"].tolist() == [0.5, 0.5, 0.5]
+    assert times["ghosts_kept_per_min"].tolist() == [2.0, 2.0, 2.0]
+
+
+def test_the_same_folder_again_differs_in_nothing(tmp_path):
+    rng = np.random.default_rng(9)
+    where = [{"object_id": str(k), "run": run} for k in range(6) for run in range(2)]
+    rows = [
+        seen("x", [float(e) for e in rng.uniform(0, 2, 4)], [float(g) for g in rng.uniform(0, 4, 4)], ghosts=1, **w)
+        for w in where
+    ]
+    lists = [ghosts("x", 20 + run, run=run, existence=[0.0, 0.5], ghosts_at=[20 + run, 3]) for run in range(2)]
+    steps = [step("x", 0.9, 0.0, **w) for w in where]
+    folders = [write_folder(tmp_path / name, rows, lists=lists, steps=steps) for name in ("first", "second")]
+    comparison = compare(folders, baseline="first:x")
+    assert comparison.table["metric"].tolist() == [
+        "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
+        "ghosts_per_min",
+    ]  # fmt: skip
+    assert (comparison.table["difference"] == 0.0).all()
+    # None of six can differ, one way or the other, where up to 46 % of all do: 1 − 0.025^(1/6).
+    share = of(comparison, "detected_share")
+    assert (share["low"], share["high"]) == pytest.approx((-0.459258, 0.459258), abs=1e-6)
+    assert share["interval"] == "exact"
+    others = comparison.table[comparison.table["metric"] != "detected_share"]
+    assert (others["interval"] == "all clusters alike").all()
+    assert others[["low", "high", "interval_over"]].isna().all(axis=None)
+    assert comparison.notes == ()
+
+
+def test_how_few_lists_both_have_is_said(tmp_path):
+    """Of four instants two are the other's; of the second log none."""
+    rows = [seen(name, FOUR, FOUR, log=log) for name in ("ideal", "late") for log in ("a", "b")]
+    folder = write_folder(tmp_path / "one", rows[::2], available_s={"late": [0.0, 0.5, 2.0, 2.5]})
+    assert compare([folder]).notes[-2:][0] == (
+        "late: position_rmse_m and gospa_m are over the 2 instants that both have, of 4 and the 4 of ideal"
+    )
+    folder = write_folder(tmp_path / "two", rows, available_s={"late": [0.25, 0.5, 0.75, 2.5]})
+    assert any(
+        note == "late: position_rmse_m and gospa_m are over the 0 instants that both have, of 8 and the 8 of ideal; "
+        "none in a, b"
+        for note in compare([folder]).notes
+    )
+    folder = write_folder(tmp_path / "same", rows)
+    assert not any("instants that both have" in note for note in compare([folder]).notes)
+
+
+@pytest.mark.parametrize(("always", "said"), [(False, 1), (True, 0)])
+def test_who_detects_by_truth_id_is_said(tmp_path, always, said):
+    rows = [row(name, 1.0, 30.0) for name in ("ideal", "GT", "gnn")]
+    path = write_folder(tmp_path / "study", rows, measure={"match": {"gate_m": 3.0, "always": always}})
+    fusions = "configurations: {GT: {units: truth}, ideal: {units: all}, gnn: {units: all, fusion: {kind: gnn}}}"
+    (path / "experiment.yaml").write_text(f"version: 1\n{fusions}\n")
+    notes = [note for note in compare([path]).notes if "by truth id" in note]
+    assert (
+        notes
+        == [
+            "ideal, GT: detected by truth id, the others by match within the gate (`match: {always: true}` matches all "
+            "alike)"
+        ]
+        * said
+    )
+    assert not [note for note in compare([path], configurations=["GT"]).notes if "by truth id" in note]

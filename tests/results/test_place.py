@@ -1,0 +1,466 @@
+"""The place of a results folder: one writer, nothing lost that is not ours, nothing piling up."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from copem_replay.core import scratch
+from copem_replay.core.errors import OutputError
+from copem_replay.core.files import atomic_file
+from copem_replay.pipeline import run as runs
+from copem_replay.results import belongings, lock, place
+from tests.helpers.experiments import TEXT, changed, drive
+from tests.system.test_cli import ROOT, Call, Ended, call, here, installed, written
+
+__all__ = ["call", "here"]  # fixtures
+
+SHOWN = changed("show: {run: 0}")
+
+
+@pytest.fixture
+def old(here: Path, call: Call) -> Path:
+    """Results of seed 1, with files in it that are the user's."""
+    assert call("run", "e.yaml").code == 0
+    folder = here / "out/e"
+    (folder / "notes.txt").write_text("mine\n")
+    (folder / "figures/more").mkdir(parents=True)
+    (folder / "figures/more/mine.svg").write_text("<svg/>")
+    (folder / "figures/runs.png").write_text("of the old results")
+    (folder / "report.html").write_text("of the old results")
+    (folder / "empty").mkdir()
+    (folder / "link").symlink_to("../../drive.mcap")
+    return folder
+
+
+MINE = {"notes.txt", "figures/more/mine.svg", "empty", "link"}
+
+
+def again(call: Call, *more: str) -> Ended:
+    return call("run", "e.yaml", "--seed", "5", "--overwrite", *more)
+
+
+def raises(error: int) -> Callable[..., None]:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(error, os.strerror(error))
+
+    return fail
+
+
+class TestOthers:
+    """What is not ours stays, and what is goes."""
+
+    def test_the_list_is_what_is_written(self, here: Path, call: Call) -> None:
+        for show in ("{logs: [all], run: [worst, 1]}", "null"):
+            (here / "e.yaml").write_text(changed(f"show: {show}", "sweep: {latency_s: [0, 0.2]}"))
+            drive(here / "b/drive.mcap")
+            assert call("run", "e.yaml", "--log", "drive.mcap", "--log", "b/drive.mcap", "--overwrite").code == 0
+            names = sorted(p.relative_to(here / "out/e").as_posix() for p in (here / "out/e").rglob("*") if p.is_file())
+            assert json.loads((here / "out/e/provenance.json").read_text())["files"] == names
+
+    @pytest.mark.parametrize("links", [True, False])
+    @pytest.mark.parametrize("in_one_step", [True, False])
+    def test_stays(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, links: bool, in_one_step: bool
+    ) -> None:
+        if not links:
+            monkeypatch.setattr(os, "link", raises(errno.EPERM))
+        if not in_one_step:
+            monkeypatch.setattr(place, "exchange", lambda *_: False)
+        before = written(old)
+        inode = (old / "notes.txt").stat().st_ino
+        assert again(call).lines == []
+        assert set(belongings.names_in(old)) == MINE | set(json.loads(before["provenance.json"])["files"])
+        assert (old / "notes.txt").read_text() == "mine\n"
+        assert ((old / "notes.txt").stat().st_ino == inode) is links
+        assert os.readlink(old / "link") == "../../drive.mcap"
+        assert written(old)["provenance.json"] != before["provenance.json"]
+        assert os.listdir(old.parent) == ["e"]
+
+    def test_of_one_name_with_new_results(self, old: Path, call: Call) -> None:
+        """`sweep.csv` of the user's, then a sweep."""
+        (old / "sweep.csv").write_text("mine\n")
+        (old / "sweep.csv.kept").write_text("mine, too\n")
+        (old.parents[1] / "e.yaml").write_text(changed("sweep: {latency_s: [0, 0.2]}"))
+        line = "note: out/e/sweep.csv: kept as sweep.csv.kept2, as the results have one of that name"
+        assert again(call).lines == [line]
+        kept = {p.name: p.read_text() for p in old.glob("sweep.csv.kept*")}
+        assert sorted(kept.values()) == ["mine\n", "mine, too\n"]
+        assert (old / "sweep.csv").read_text().startswith("sweep,value")
+
+    def test_that_came_while_the_folder_was_exchanged(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        exchange = place.exchange
+
+        def late(one: Path, other: Path) -> bool:
+            (other / "late.txt").write_text("late\n")
+            return exchange(one, other)
+
+        monkeypatch.setattr(place, "exchange", late)
+        assert again(call).code == 0
+        assert (old / "late.txt").read_text() == "late\n"
+        assert os.listdir(old.parent) == ["e"]
+
+    def test_results_of_an_older_version_are_replaced(self, old: Path, call: Call) -> None:
+        """They have no list: of them goes what the new ones have, too."""
+        said = json.loads((old / "provenance.json").read_text())
+        files = said.pop("files")
+        (old / "provenance.json").write_text(json.dumps(said))
+        assert again(call).lines == []
+        assert set(belongings.names_in(old)) == MINE | set(files)
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", '{"tool": "another"}'])
+    def test_a_folder_with_the_provenance_of_something_else_is_not_replaced(
+        self, old: Path, call: Call, text: str
+    ) -> None:
+        (old / "provenance.json").write_text(text)
+        before = written(old)
+        assert again(call) == (2, "", ["out/e: not empty and no results folder; choose another with --out"])
+        assert written(old) == before
+
+    def test_a_mount_point_within(self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(os.path, "ismount", lambda path: path == "out/e/figures/more")
+        line = "out/e/figures/more: a mount point cannot be replaced; choose another folder with --out"
+        assert again(call) == (2, "", [line])
+
+    def test_a_recording_of_the_users_in_it_may_be_replayed(self, old: Path, call: Call) -> None:
+        drive(old / "mine.mcap")
+        assert again(call, "--log", "out/e/mine.mcap").code == 0
+        assert (old / "mine.mcap").exists()
+
+
+class TestOneWriter:
+    def test_a_second_run_is_refused_before_it_replays(
+        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with place.taken(here / "out/e", overwrite=False):
+            monkeypatch.setattr(runs.replays, "outcomes", raises(errno.EIO))
+            ended = call("run", "e.yaml")
+        assert ended.code == 2
+        assert ended.lines == [
+            f"{here}/out/e: another run (process {os.getpid()} on {os.uname().nodename}) is writing its results there; "
+            "wait until it has ended, or choose another folder with --out"
+        ]
+        assert not (here / "out").exists()
+
+    def test_two_processes(self, here: Path) -> None:
+        """The first stands still until the second has ended; and then is done."""
+        code = (
+            "import sys\nfrom copem_replay import cli, run\n"
+            "replay = run.run\n"
+            "def waits(*a, **k):\n    print('now', flush=True)\n    sys.stdin.readline()\n    return replay(*a, **k)\n"
+            "run.run = waits\nsys.argv = ['copem-replay', 'run', 'e.yaml']\ncli.main()\n"
+        )
+        first = subprocess.Popen(
+            [sys.executable, "-c", code], cwd=here, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert first.stdout is not None
+        assert first.stdout.readline() == "now\n"
+        second = installed("run", "e.yaml", "--overwrite", folder=here)
+        assert second.returncode == 2
+        assert f"another run (process {first.pid} on " in second.stderr
+        first.communicate("\n")
+        assert first.returncode == 0
+        assert os.listdir(here / "out") == ["e"]
+
+    @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
+    def test_without_locks_what_finishes_second_has_another_name(
+        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, code: int
+    ) -> None:
+        monkeypatch.setattr(fcntl, "flock", raises(code))
+        replay = runs.run
+        seeds = iter("23")
+
+        def meanwhile(*a: Any, **k: Any) -> Any:
+            seed = next(seeds, None)
+            if seed is not None:  # another run, from beginning to end
+                assert call("run", "e.yaml", "--seed", seed).code == 0
+            return replay(*a, **k)
+
+        monkeypatch.setattr(runs, "run", meanwhile)
+        ended = call("run", "e.yaml")
+        assert ended.code == 0
+        found = {
+            path.name: json.loads((path / "provenance.json").read_text())["seed"] for path in (here / "out").iterdir()
+        }
+        assert found == {"e": 3, "e-2": 2, "e-3": 1}
+        assert ended.lines == [
+            f"note: out/e: something else came there during the run, and stays; its results are in {here}/out/e-3"
+        ]
+        assert ended.out.endswith(f"results in {here}/out/e-3\n")
+
+    def test_without_locks_overwriting_what_another_run_has_just_written(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(fcntl, "flock", raises(errno.ENOLCK))
+        exchange = place.exchange
+        count = iter(range(9))
+
+        def meanwhile(one: Path, other: Path) -> bool:
+            if next(count) == 0:  # at the last instant
+                assert again(call).code == 0
+            return exchange(one, other)
+
+        monkeypatch.setattr(place, "exchange", meanwhile)
+        assert call("run", "e.yaml", "--seed", "6", "--overwrite").code == 0
+        seeds = {path.name: json.loads((path / "provenance.json").read_text())["seed"] for path in old.parent.iterdir()}
+        assert seeds == {"e": 5, "e-2": 6}
+
+    def test_a_lock_file_that_is_left_is_no_lock(self, here: Path, call: Call) -> None:
+        (here / "out").mkdir()
+        (here / "out/.e.lock").write_text("process 1 on moon\n")
+        assert call("run", "e.yaml").code == 0
+        assert os.listdir(here / "out") == ["e"]
+
+    def test_a_lock_file_that_goes_before_it_is_locked(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What was opened has no name any more: the lock of another file is taken."""
+        path = tmp_path / ".e.lock"
+        opened = lock._open
+        left = [1, 1]
+
+        def vanishing(path: Path) -> int:
+            fd = opened(path)
+            if left:
+                left.pop()
+                path.unlink()
+            return fd
+
+        monkeypatch.setattr(lock, "_open", vanishing)
+        with lock.only_writer(tmp_path / "e"):
+            assert not left
+            with pytest.raises(OutputError, match="another run"), lock.only_writer(tmp_path / "e"):
+                pass
+            assert path.exists()
+        assert not path.exists()
+
+    @pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
+    def test_something_else_in_the_place_of_the_lock(self, here: Path, call: Call, kind: str) -> None:
+        (here / "out").mkdir()
+        path = here / "out/.e.lock"
+        {"link": lambda: path.symlink_to(here / "e.yaml"), "folder": path.mkdir, "pipe": lambda: os.mkfifo(path)}[
+            kind
+        ]()
+        ended = call("run", "e.yaml")
+        assert ended.code == (0 if kind == "pipe" else 2)
+        assert (here / "e.yaml").read_text() == TEXT
+
+    def test_a_name_as_long_as_it_may_be(self, here: Path, call: Call) -> None:
+        name = "ü" * 127
+        for _ in range(2):
+            assert call("run", "e.yaml", "--out", name, "--overwrite").code == 0
+        assert sorted(os.listdir(here)) == ["drive.mcap", "e.yaml", name]
+
+
+class TestFlushed:
+    def test_all_is_on_the_disk_before_it_has_its_name(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (old.parents[1] / "e.yaml").write_text(SHOWN)
+        flushed: set[tuple[int, int]] = set()
+        fsync, exchange = os.fsync, place.exchange
+
+        def noted(fd: int) -> None:
+            found = os.fstat(fd)
+            flushed.add((found.st_dev, found.st_ino))
+            fsync(fd)
+
+        def ready(new: Path, other: Path) -> bool:
+            every = [new, *new.rglob("*")]
+            here = {(p.lstat().st_dev, p.lstat().st_ino) for p in every if not p.is_symlink()}
+            assert len(every) > 15
+            assert here <= flushed
+            return exchange(new, other)
+
+        monkeypatch.setattr(os, "fsync", noted)
+        monkeypatch.setattr(place, "exchange", ready)
+        assert again(call).code == 0
+        assert (old.parent.stat().st_dev, old.parent.stat().st_ino) in flushed
+
+    def test_a_file_and_the_folder_it_is_named_in(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        flushed = []
+        monkeypatch.setattr(os, "fsync", lambda fd: flushed.append(os.fstat(fd).st_ino))
+        with atomic_file(tmp_path / "a.csv") as path:
+            path.write_text("1\n")
+        assert flushed == [(tmp_path / "a.csv").stat().st_ino, tmp_path.stat().st_ino]
+
+
+class TestLeftovers:
+    """Of processes that were killed."""
+
+    def left(self, folder: Path, files: list[str], there: list[str], same: dict[str, str] | None = None) -> Path:
+        """What a killed process leaves: its list, its lock free, and files."""
+        path = folder.parent / f".{folder.name}.abcd_123.tmp"
+        path.mkdir(parents=True)
+        (path / scratch.MANIFEST).write_text(json.dumps({"files": files, "same": same or {}}))
+        for name in there:
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            (path / name).write_text("x")
+        return path
+
+    def removed(self, path: Path) -> str:
+        return f"note: {path}: removed, left by a process that was killed"
+
+    def kept(self, path: Path) -> str:
+        return f"note: {path}: left by a process that was killed, and not removed: it holds what is not ours"
+
+    def test_go_and_it_is_said(self, here: Path, call: Call) -> None:
+        path = self.left(here / "out/e", ["results/summary.csv", "results/replay/a.rrd"], ["results/replay/a.rrd"])
+        assert call("run", "e.yaml").lines == [self.removed(path)]
+        assert os.listdir(here / "out") == ["e"]
+
+    def test_go_when_the_run_itself_is_refused(self, here: Path, call: Call) -> None:
+        path = self.left(here / "out/e", [], [])
+        (here / "drive.mcap").unlink()
+        ended = call("run", "e.yaml")
+        assert ended.code == 2
+        assert ended.lines[0] == self.removed(path)
+
+    def test_with_a_file_that_is_in_no_list_stay(self, here: Path, call: Call) -> None:
+        path = self.left(here / "out/e", ["results/a"], ["results/a", "results/thesis.tex", "results/files.json"])
+        for _ in range(2):
+            assert call("run", "e.yaml", "--overwrite").lines == [self.kept(path)]
+            assert {p.name for p in (path / "results").iterdir()} == {"thesis.tex", "files.json"}
+
+    @pytest.mark.parametrize("text", [None, "", "{", "[]", '{"files": 3}', '{"files": [[]], "same": {}}'])
+    def test_without_a_list_stay_unless_they_are_empty(self, here: Path, call: Call, text: str | None) -> None:
+        path = self.left(here / "out/e", [], ["results/summary.csv"])
+        if text is None:
+            (path / scratch.MANIFEST).unlink()
+        else:
+            (path / scratch.MANIFEST).write_text(text)
+        assert call("run", "e.yaml").lines == [self.kept(path)]
+        assert (path / "results/summary.csv").exists()
+        shutil.rmtree(path / "results")
+        assert call("run", "e.yaml", "--overwrite").lines == [self.removed(path)]
+
+    def test_of_a_process_that_lives_stay(self, here: Path, call: Call) -> None:
+        path = self.left(here / "out/e", ["results/a"], ["results/a"])
+        with (path / scratch.MANIFEST).open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            assert call("run", "e.yaml").lines == []
+            assert (path / "results/a").exists()
+        assert call("run", "e.yaml", "--overwrite").lines == [self.removed(path)]
+
+    def test_stay_where_there_are_no_locks(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = self.left(here / "out/e", ["results/a"], ["results/a"])
+        monkeypatch.setattr(fcntl, "flock", raises(errno.ENOLCK))
+        assert call("run", "e.yaml").lines == []
+        assert (path / "results/a").exists()
+
+    def test_of_other_places_stay(self, here: Path, call: Call) -> None:
+        other = self.left(here / "out/e.x", [], [])
+        mine = here / "out/.e.thesis.tmp"
+        mine.mkdir()
+        assert call("run", "e.yaml").lines == []
+        assert other.exists()
+        assert mine.exists()
+
+    @pytest.mark.parametrize("equal", [True, False])
+    def test_with_a_file_of_the_users_go_where_it_is_in_the_results(self, old: Path, call: Call, equal: bool) -> None:
+        """After the exchange the old folder, with links to what stays, is still there."""
+        path = self.left(old, [], [], {"results/notes.txt": "e/notes.txt"})
+        (path / "results").mkdir()
+        if equal:
+            os.link(old / "notes.txt", path / "results/notes.txt")
+        else:
+            (path / "results/notes.txt").write_text("mine!")
+        assert again(call).lines == [self.removed(path) if equal else self.kept(path)]
+        assert (old / "notes.txt").read_text() == "mine\n"
+
+    def test_a_folder_that_was_moved_away_is_put_back(self, old: Path, call: Call) -> None:
+        before = written(old)
+        path = self.left(old, [f"{at}/{name}" for at in ("old", "results") for name in before], ["results/summary.csv"])
+        os.rename(old, path / "old")
+        ended = call("run", "e.yaml", "--seed", "5")
+        assert ended.code == 2
+        assert ended.lines == [
+            "out/e: results are there already; --overwrite replaces them, --out chooses another folder"
+        ]
+        assert written(old) == before
+
+    def test_of_a_file_in_them_go_with_them(self, here: Path, call: Call) -> None:
+        path = self.left(here / "out/e", ["results/replay.rrd"], [])
+        self.left(path / "results/replay.rrd", ["replay.rrd"], ["replay.rrd"])
+        assert call("run", "e.yaml").lines == [self.removed(path)]
+
+    def test_of_figures_pages_and_tables(self, old: Path, call: Call) -> None:
+        for file in (old / "report.html", old / "figures", old.parent / "c.csv"):
+            self.left(file, [file.name, "runs.png"], ["runs.png"])
+        inside = old / "figures/.figures.abcd_124.tmp"
+        shutil.copytree(old / ".figures.abcd_123.tmp", inside)
+        assert call("report", "out/e").lines == [
+            "note: out/e/.report.html.abcd_123.tmp: removed, left by a process that was killed"
+        ]
+        assert call("compare", "out/e", "--baseline", "GT", "--out", "out/c.csv").lines[-1] == (
+            "note: out/.c.csv.abcd_123.tmp: removed, left by a process that was killed"
+        )
+        assert call("plot", "out/e").lines[-2:] == [
+            "note: out/e/figures/.figures.abcd_124.tmp: removed, left by a process that was killed",
+            "note: out/e/.figures.abcd_123.tmp: removed, left by a process that was killed",
+        ]
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_what_is_made_of_old_results_does_not_get_among_new_ones(
+    old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Results that are replaced while figures are drawn, or a page is made."""
+    from copem_replay.report.figures import write as figures
+    from copem_replay.report.html import page
+
+    def meanwhile(original: Callable[..., Any]) -> Callable[..., Any]:
+        def replaced(*a: Any, **k: Any) -> Any:
+            assert call("run", "e.yaml", "--seed", "5", "--overwrite").code == 0
+            return original(*a, **k)
+
+        return replaced
+
+    monkeypatch.setattr(figures, "curves_figure", meanwhile(figures.curves_figure))
+    monkeypatch.setattr(page, "page", meanwhile(page.page))
+    ended = call(command, "out/e")
+    assert ended.code == 2
+    assert ended.lines[-1] == "out/e: other results took its place while it was read; do it once more"
+    assert set(belongings.names_in(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
+
+
+def test_tables_of_old_and_new_results_are_not_read_as_one(
+    old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from copem_replay.results import folders
+
+    experiment = folders._experiment
+    replaced = iter([True])
+
+    def meanwhile(path: Path) -> Any:
+        if next(replaced, False):
+            assert again(call).code == 0
+        return experiment(path)
+
+    monkeypatch.setattr(folders, "_experiment", meanwhile)
+    ended = call("compare", "out/e", "--baseline", "GT")
+    assert (ended.code, ended.lines[-1]) == (
+        2,
+        "out/e: other results took its place while it was read; do it once more",
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("two_steps", [False, True])
+def test_killed_at_any_moment(two_steps: bool) -> None:
+    """Nothing half-written, nothing of the user's gone, nothing piling up, the next run as if there had been none."""
+    tool = [sys.executable, ROOT / "tools/kill_runs.py", "--kills", "20"]
+    ended = subprocess.run([*tool, *["--two-steps"] * two_steps], capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert ended.stdout.startswith("20 kills, ")
+    assert "wrong: 0;" in ended.stdout

@@ -1,0 +1,276 @@
+"""Which configurations are meant, and what a comparison looks like."""
+
+from __future__ import annotations
+
+import csv
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.results.compare import (
+    Comparison,
+    check_out,
+    compare,
+    comparison_markdown,
+    comparison_text,
+    write_comparison,
+)
+from copem_replay.results.compare.tables import in_markdown
+from tests.helpers.compare_folders import Row, row, write_folder
+
+
+def rows(*names: str) -> list[Row]:
+    return [row(name, 1.0, 30.0) for name in names]
+
+
+def study(tmp_path: Path, name: str, *configurations: str, **given: Any) -> Path:
+    return write_folder(tmp_path / name, rows(*configurations), **given)
+
+
+def problem(*folders: Path, **options: Any) -> str:
+    with pytest.raises(InputError) as caught:
+        compare(folders, **options)
+    (found,) = caught.value.problems
+    return found
+
+
+# ----------------------------------------------------------------------------------------------------- names
+
+
+def test_all_configurations_are_compared_with_the_ideal(tmp_path):
+    comparison = compare([study(tmp_path, "a", "GT", "ideal", "PEM")])
+    assert comparison.baseline == "ideal"
+    assert comparison.configurations == ("GT", "PEM")
+
+
+def test_names_that_several_folders_have_get_the_folders(tmp_path):
+    folders = [study(tmp_path, "old", "ideal", "GT", "nms"), study(tmp_path, "new", "GT", "gnn")]
+    comparison = compare(folders)
+    assert comparison.baseline == "ideal"
+    assert comparison.configurations == ("old:GT", "nms", "new:GT", "gnn")
+
+
+def test_folders_of_one_name_are_told_apart_by_their_paths(tmp_path):
+    folders = [study(tmp_path, "a/out", "ideal", "GT"), study(tmp_path, "b/out", "GT")]
+    assert compare(folders).configurations == (f"{folders[0]}:GT", f"{folders[1]}:GT")
+
+
+def test_a_name_that_looks_like_a_folders_is_no_other_ones(tmp_path):
+    folders = [study(tmp_path, "a", "ideal", "x", "b:x"), study(tmp_path, "b", "x")]
+    comparison = compare(folders)
+    assert len(set(comparison.configurations)) == 3
+    assert set(comparison.table["configuration"]) == set(comparison.configurations)
+
+
+def test_a_name_stands_for_all_that_bear_it(tmp_path):
+    folders = [study(tmp_path, "a", "ideal", "GT", "nms"), study(tmp_path, "b", "GT", "gnn")]
+    assert compare(folders, configurations=["GT"]).configurations == ("a:GT", "b:GT")
+    assert compare(folders, configurations=["b:GT", "a:nms", "nms"]).configurations == ("b:GT", "nms")
+    assert compare(folders, configurations=["nms", "gnn"], baseline="b:GT").baseline == "b:GT"
+
+
+def test_a_configurations_own_name_goes_before_that_with_a_folders(tmp_path):
+    folders = [study(tmp_path, "a", "ideal", "b:x"), study(tmp_path, "b", "x")]
+    assert compare(folders, configurations=["b:x"]).configurations == ("b:x",)
+
+
+def test_a_baseline_is_one_configuration(tmp_path):
+    folders = [study(tmp_path, "a", "ideal", "GT"), study(tmp_path, "b", "ideal", "GT")]
+    assert problem(*folders) == "--baseline: expected one of a:ideal, b:ideal, found ideal, which may be any"
+    assert problem(*folders, baseline="GT") == "--baseline: expected one of a:GT, b:GT, found GT, which may be any"
+    assert compare(folders, baseline="b:ideal").configurations == ("a:ideal", "a:GT", "b:GT")
+
+
+def test_without_an_ideal_the_baseline_has_to_be_named(tmp_path):
+    folder = study(tmp_path, "a", "GT", "PEM")
+    assert problem(folder) == (
+        "--baseline: expected a configuration to compare with, as none is named ideal; there are GT, PEM"
+    )
+    assert problem(folder, baseline="PEN") == "--baseline: no configuration is named 'PEN'; did you mean PEM?"
+    assert problem(folder, baseline="zzz") == "--baseline: no configuration is named 'zzz'; there are GT, PEM"
+
+
+def test_every_unknown_configuration_is_said(tmp_path):
+    with pytest.raises(InputError) as caught:
+        compare([study(tmp_path, "a", "ideal", "track", "nms")], configurations=["trakc", "nms", "nsm"])
+    assert caught.value.problems == (
+        "--configurations: no configuration is named 'trakc'; did you mean track?",
+        "--configurations: no configuration is named 'nsm'; did you mean nms?",
+    )
+
+
+def test_a_baseline_alone_is_nothing_to_compare(tmp_path):
+    folder = study(tmp_path, "a", "ideal", "GT")
+    expected = "compare: expected a configuration beside the baseline ideal, found none"
+    assert problem(folder, configurations=["ideal"]) == expected
+    assert problem(study(tmp_path, "b", "ideal")) == expected
+
+
+# ---------------------------------------------------------------------------------------------------- tables
+
+
+def six_objects(tmp_path: Path) -> Comparison:
+    """`fast` is 0.25 s earlier than the baseline at each of six, `worse` loses half of them, `same` is the same."""
+    found = []
+    for k in range(6):
+        found += [row("ideal", 1.0, 30.0, object_id=str(k)), row("same", 1.0, 30.0, object_id=str(k))]
+        found += [row("fast", 0.75, 32.5, object_id=str(k))]
+        found += [row("a|worse", 1.0 if k % 2 else None, 30.0 if k % 2 else None, object_id=str(k))]
+    return compare([write_folder(tmp_path / "study", found)])
+
+
+def test_the_table_has_signs_and_intervals(tmp_path):
+    lines = comparison_text(six_objects(tmp_path)).splitlines()
+    assert lines[0].split() == ["configuration", "detected_share", "ttd_rmst_s", "dad_median_m"]
+    by_name = {line.split()[0]: line for line in lines[1:4]}
+    # Of six: 1 − 0.025^(1/6).
+    assert by_name["same"].split(maxsplit=1)[1].split("  ")[0] == "±0 [-0.459, 0.459]"
+    assert by_name["same"].count("±0 (all alike)") == 2
+    assert "-0.25 (all alike)" in by_name["fast"]
+    assert "+2.5 (all alike)" in by_name["fast"]
+    assert "-0.5 [-1, 0]" in by_name["a|worse"]  # six are few: anything
+    assert "+4.5 [" in by_name["a|worse"]
+    assert by_name["a|worse"].endswith("–")  # half of them never: no median
+    assert all("…" not in line and "..." not in line for line in lines)
+
+
+def test_what_the_table_shows_is_said_below(tmp_path):
+    lines = comparison_text(six_objects(tmp_path)).splitlines()[4:]
+    assert lines == [
+        "differences to ideal, paired by log, object and run; accuracy at instants that both have",
+        "[95 %]: bootstrap interval over objects",
+        "detected_share: exact binomial limits where the difference is the same in every cluster, for resamples then "
+        "are all the same, too",
+        "(all alike): the difference is the same in every cluster, so that nothing tells how it varies",
+        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that, who was still there at the "
+        "end as censored",
+    ]
+
+
+def test_who_is_better_beyond_the_interval_is_said(tmp_path):
+    rows = [row("ideal", 1.0, 30.0, object_id=str(k)) for k in range(6)]
+    rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
+    lines = comparison_text(compare([write_folder(tmp_path / "study", rows)])).splitlines()
+    assert lines[-2:] == [
+        "better than ideal in ttd_rmst_s, the interval excluding 0: fast",
+        "better than ideal in dad_median_m, the interval excluding 0: fast",
+    ]
+
+
+def test_without_an_interval_nothing_is_claimed(tmp_path):
+    text = comparison_text(compare([write_folder(tmp_path / "a", [row("ideal", 1.0, 30.0), row("fast", 0.5, 35.0)])]))
+    assert "-0.5" in text
+    assert "[" not in text
+    assert "better" not in text
+
+
+def test_markdown_has_the_same_content(tmp_path):
+    comparison = six_objects(tmp_path)
+    text, markdown = comparison_text(comparison).splitlines(), comparison_markdown(comparison).splitlines()
+    assert markdown[0] == "| configuration | detected_share | ttd_rmst_s | dad_median_m |"
+    assert markdown[1] == "| --- | --- | --- | --- |"
+    cells = [line.replace("\\|", "\0").strip("| ").split(" | ") for line in markdown[2:5]]
+    assert [c[0] for c in cells] == ["same", "fast", "a\0worse"]
+    for line, of_row in zip(text[1:4], cells, strict=True):
+        assert line.split() == " ".join(of_row).replace("\0", "|").split()
+    notes = [f"note: {note}" for note in comparison.notes]
+    assert len(notes) == 1
+    assert [line.removeprefix("- ") for line in markdown[6:]] == [*text[4:], *notes]
+
+
+class Cells(HTMLParser):
+    """The text of table cells and list items."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        assert tag in ("table", "thead", "tbody", "tr", "th", "td", "ul", "li"), f"<{tag}> was made of text"
+        if tag in ("th", "td", "li"):
+            self.found.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.found:
+            self.found[-1] += data
+
+
+def read_markdown(text: str) -> list[str]:
+    cells = Cells()
+    cells.feed(MarkdownIt("commonmark").enable(["table", "strikethrough"]).render(text))
+    return [cell.strip() for cell in cells.found]
+
+
+PIECES = st.sampled_from(
+    ["*", "_", "`", "~~", "[", "](", "x](y)", "![", "<b>", "&lt;", "|", "\\", "a", "b_c", " ", "$", "#"]
+)
+
+
+@given(st.lists(PIECES, min_size=1).map("".join) | st.text(st.characters(categories=["L", "P", "S", "Zs"]), min_size=1))
+@example("<script>alert(1)</script>")
+@example("[click](javascript:alert(1))")
+@example("&copy; __a__ *b* `c` ~~d~~ http://e.f \\| g")
+def test_whatever_a_name_is_markdown_shows_it(name):
+    shown = " ".join(name.split())
+    table = (
+        f"| {in_markdown(shown)} | b |\n| --- | --- |\n| {in_markdown(shown)} | d |\n\n- name: {in_markdown(shown)}\n"
+    )
+    heading, _, cell, _, item = read_markdown(table)
+    assert (heading, cell, item) == (shown, shown, f"name: {shown}".strip())
+
+
+def test_csv_has_a_row_for_each_log_configuration_and_metric(tmp_path):
+    out = tmp_path / "new" / "regret.csv"
+    write_comparison(six_objects(tmp_path), out)
+    with out.open(newline="", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert list(read[0]) == [
+        "log", "configuration", "baseline", "metric", "value", "baseline_value", "difference", "low", "high",
+        "interval", "interval_over", "n", "p_value", "only_configuration", "only_baseline", "existence",
+        "baseline_existence",
+        "ghosts_kept_per_min", "baseline_ghosts_kept_per_min",
+    ]  # fmt: skip
+    assert [(r["log"], r["configuration"], r["metric"]) for r in read[3:6]] == [
+        ("all", "fast", "detected_share"), ("all", "fast", "ttd_rmst_s"), ("all", "fast", "dad_median_m"),
+    ]  # fmt: skip
+    fast, share = read[4], read[6]
+    assert (fast["value"], fast["baseline_value"], fast["difference"], fast["n"]) == ("0.75", "1", "-0.25", "6")
+    assert (fast["p_value"], fast["only_baseline"], fast["existence"]) == ("", "", "")
+    assert (share["only_configuration"], share["only_baseline"], share["p_value"]) == ("0", "3", "0.25")
+    assert (read[8]["difference"], read[8]["low"], read[8]["interval_over"]) == ("", "", "")
+    assert (fast["low"], fast["interval"], share["interval"]) == ("", "all clusters alike", "bootstrap")
+
+
+def test_the_files_name_says_what_is_written(tmp_path):
+    comparison = six_objects(tmp_path)
+    write_comparison(comparison, tmp_path / "regret.MD")
+    assert (tmp_path / "regret.MD").read_text(encoding="utf-8") == comparison_markdown(comparison)
+    with pytest.raises(OutputError, match=r"expected a name that ends with \.csv or \.md, found regret\.txt"):
+        check_out(tmp_path / "regret.txt")
+    with pytest.raises(OutputError):
+        write_comparison(comparison, tmp_path / "regret")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_comparison(comparison, tmp_path / "file" / "regret.csv")
+
+
+def test_results_are_not_overwritten_with_their_comparison(tmp_path):
+    folder = study(tmp_path, "a", "ideal", "GT")
+    with pytest.raises(OutputError, match=r"summary\.csv: expected another name, found that of a table of the results"):
+        check_out(folder / "summary.csv")
+    check_out(folder / "regret.csv")
+    check_out(tmp_path / "summary.csv")
+
+
+def test_rows_of_single_logs_are_in_the_csv_only(tmp_path):
+    found = [row(name, 1.0, 30.0, log=log) for name in ("ideal", "late") for log in ("all", "b")]
+    comparison = compare([write_folder(tmp_path / "study", found)])
+    assert comparison.table["log"].tolist() == ["all"] * 6 + ["b"] * 3  # a log may have that name, too
+    assert comparison.overall["n"].tolist() == [2, 2, 2]
+    assert len([line for line in comparison_text(comparison).splitlines() if line.startswith("late")]) == 1

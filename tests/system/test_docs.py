@@ -1,0 +1,147 @@
+"""The documentation is true: its commands run, its output is real, its experiments load, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from copem_replay.cli import main as cli
+from copem_replay.core.view_geometry import Look
+from copem_replay.experiment.file import load, parse
+from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.base import StepFusion
+from copem_replay.fusion.testing.check import check_fusion
+from copem_replay.perception.pem.detection import DetectionModel
+from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.run import Result
+from tests.helpers import scenes
+from tests.helpers.scenes import experiment
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
+
+
+def test_readme_shows_what_its_commands_print(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.findall(r"<!-- output: (.*?) -->\n```text\n(.*?)```", text, re.DOTALL)
+    before = re.findall(r"<!-- before: (.*?) -->", text)
+    assert [command.split()[:2] for command in before] == [["copem-replay", "run"]]
+    assert [command.split()[0] for command, _ in found] == ["copem-replay", "python", "copem-replay"]
+    monkeypatch.chdir(ROOT)
+
+    def printed(command: str) -> str:
+        words = [str(tmp_path / word) if word.startswith("out/") else word for word in shlex.split(command)]
+        if words[0] == "python":
+            done = subprocess.run([sys.executable, *words[1:]], check=True, capture_output=True, text=True)
+            return done.stdout.replace(f"{tmp_path}/", "")
+        monkeypatch.setattr("sys.argv", words)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == 0
+        return capsys.readouterr().out.replace(f"{tmp_path}/", "")
+
+    for command in before:
+        printed(command)
+    for command, expected in found:
+        assert printed(command) == expected
+
+
+def test_readme_experiment_loads(tmp_path: Path) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"<!-- experiment -->\n```yaml\n(.*?)```", text, re.DOTALL)
+    assert blocks
+    for k, block in enumerate(blocks):
+        path = tmp_path / f"{k}.yaml"
+        path.write_text(block, encoding="utf-8")
+        experiment, problems = parse(load(path))
+        assert problems == []
+        assert isinstance(experiment, Experiment)
+
+
+def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(ROOT)
+    namespace: dict[str, object] = {"__name__": "page"}
+    exec(code, namespace)
+    result = namespace["result"]
+    assert isinstance(result, Result)
+    assert len(result.table) > 0
+    assert len(result.summary) == 1
+
+
+@pytest.fixture
+def architecture(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The Python of the architecture page, as the module `page`."""
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    page = ModuleType("page")
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(code, vars(page))
+    monkeypatch.setitem(sys.modules, "page", page)
+    return page
+
+
+def test_own_model_of_the_architecture_page_works(architecture: ModuleType) -> None:
+    fading = architecture.Fading
+    assert isinstance(fading, type)
+    assert issubclass(fading, DetectionModel)
+    one = np.ones(1)
+    look = Look(one * 20, one, one, one, np.zeros(1, dtype=np.int8), one, one, one, one, one)
+    assert fading(kind="page:Fading", half_range_m=20.0).probability(look) == pytest.approx(0.5)
+
+
+def test_own_error_model_of_the_architecture_page_works(architecture: ModuleType) -> None:
+    couple = {"detection": {"kind": "page:Fading", "half_range_m": 1e9}}
+    plan = experiment(pems={"sure": [couple | {"error": {"kind": "page:Widening", "sigma_m_per_m": 0.1}}]})
+    log = scenes.oncoming_car()
+    fused = believed(prepare(log, plan), plan, 0)["PEM"].fused
+    rows = np.flatnonzero(fused.valid[0])
+    away_m = 100.0 - 10.0 * fused.captured_s[fused.frame_ix[rows]]  # the car comes at 10 m/s along the x axis
+    assert fused.cov_ee_m2 is not None
+    assert fused.yaw_var_rad2 is not None
+    assert fused.cov_ee_m2[0, rows] == pytest.approx((0.1 * away_m) ** 2)
+    assert fused.yaw_var_rad2[0, rows] == pytest.approx(0.05**2)
+    off_m = (fused.x_m[0, rows] - away_m) / (0.1 * away_m)
+    assert 0.5 < np.std(off_m[away_m > 1]) < 1.5
+
+
+def test_own_fusion_of_the_fusion_page_works() -> None:
+    text = (ROOT / "docs/fusion.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    namespace: dict[str, object] = {"__name__": "page"}
+    exec(code, namespace)
+    surest = namespace["Surest"]
+    assert isinstance(surest, type)
+    assert issubclass(surest, StepFusion)
+    check_fusion(surest(kind="page:Surest"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_within_the_project_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), target
+
+
+def test_architecture_names_every_file() -> None:
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    for path in (ROOT / "copem_replay").rglob("*.py"):
+        name = path.relative_to(ROOT / "copem_replay").as_posix()
+        folder = name.split("/")[0] + "/" if "/" in name else None
+        assert path.name == "__init__.py" or name in text or (folder and f"`{folder}`" in text), name
+
+
+def test_decisions_fit_on_a_page() -> None:
+    pages = sorted((ROOT / "docs/decisions").glob("*.md"))
+    assert [int(path.name[:4]) for path in pages[:17]] == list(range(1, 18))
+    for path in pages:
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 30, path.name

@@ -1,0 +1,219 @@
+"""The tools: what they compute by hand, and that they run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binom
+
+from copem_replay.experiment.file import load
+from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.metrics.survival import wilson
+from copem_replay.pipeline.run import run
+from tests.helpers.reports import reports_of
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT.parent / "shared" / "data"
+sys.path.insert(0, str(ROOT / "tools"))
+
+import bench  # noqa: E402
+import bench_fusion  # noqa: E402
+import bench_long  # noqa: E402
+import calibrate_tc016d  # noqa: E402
+import lidar_visibility  # noqa: E402
+import make_logs  # noqa: E402
+import paper  # noqa: E402
+
+
+def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
+    assert lidar_visibility.spearman(np.array([1.0, 2, 3]), np.array([10.0, 400, 5000])) == pytest.approx(1)
+    # Ranks 1 2 3 and 2 1 3: 1 − 6 · (1 + 1 + 0) / (3 · 8) = 0.5
+    assert lidar_visibility.spearman(np.array([1.0, 2, 3]), np.array([5.0, 4, 9])) == pytest.approx(0.5)
+    # Of the pairs (positive, negative): .9 > .1, .9 > .5, .5 > .1, .5 = .5: 3.5 of 4
+    score, positive = np.array([0.9, 0.5, 0.5, 0.1]), np.array([True, True, False, False])
+    assert lidar_visibility.auc(score, positive) == pytest.approx(3.5 / 4)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
+def test_visible_share_tells_what_lidar_sees() -> None:
+    """Floors from a spike (.765, .908); without heights the share tells less."""
+    command = [sys.executable, "tools/lidar_visibility.py", str(DATA / "av2_3b3570b4.mcap")]
+    done = subprocess.run(
+        [*command, str(DATA / "av2_3b3570b4.lidar_points.csv")], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    (line,) = done.stdout.splitlines()
+    found = json.loads(line)
+    assert list(found) == ["n", "surface_spearman", "surface_auc", "flat_spearman", "flat_auc"]
+    assert found["n"] > 500
+    assert found["surface_spearman"] >= 0.74
+    assert found["surface_auc"] >= 0.88
+    assert found["flat_spearman"] < found["surface_spearman"]
+    assert found["flat_auc"] < found["surface_auc"]
+
+
+def test_lidar_visibility_says_what_is_wrong() -> None:
+    command = [sys.executable, "tools/lidar_visibility.py", "nowhere.mcap", "points.csv"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert done.stderr.splitlines() == ["nowhere.mcap: no such file"]
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [
+        ("paper", {"paper_draw_ratio"}),
+        ("reading", {"read_ratio"}),
+        pytest.param("writing", {"mcap_objects_per_s", "rrd_boxes_per_s"}, marks=pytest.mark.long),
+    ],
+)
+def test_benchmarks_print_json_lines(
+    name: str, keys: set[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How fast does not matter here: each is called once."""
+    monkeypatch.setattr(bench, "best", lambda work, times=5: bench._seconds(work))
+    bench.main([name])
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    printed = {key for line in lines for key in line}
+    assert keys <= printed
+    assert all(value > 0 for line in lines for value in line.values() if not isinstance(value, str))
+
+
+def test_the_benchmarks_plain_loop_reads_what_the_reader_reads(tmp_path: Path) -> None:
+    """The ratio compares like with like: as many object states."""
+    from copem_replay.io.recording import read
+
+    world = bench.boxes(5, 7)
+    bench._write_truth(tmp_path / "b.mcap", world)
+    recording = read(tmp_path / "b.mcap", name="b")
+    assert bench._plain_loop(tmp_path / "b.mcap") == len(recording.truth.frame_ix) == 35
+    assert recording.truth.x_m[0] == pytest.approx(world.x_m[0])
+
+
+def once(work: Callable[[], object], _times: int) -> float:
+    return bench._seconds(work)
+
+
+def test_the_crossing_is_fused_by_each_configuration() -> None:
+    experiment, recordings = bench._loaded(ROOT / "logs/crossing.yaml")
+    some = {name: experiment.configurations[name] for name in ("ideal", "union", "tracker:replay:mixed")}
+    short = experiment.model_copy(update={"runs": 2, "configurations": some})
+    lines = list(bench_fusion.crossing(once, short, recordings[0]))
+    assert [line["algorithm"] for line in lines] == list(some)
+    for line in lines:
+        assert line["fusion_lists_per_s"] * line["us_per_list"] == pytest.approx(1e6, rel=0.01)
+        assert line["lists_per_s_two_threads"] > 0
+
+
+def test_what_units_report_in_fusion_benchmarks() -> None:
+    """The same as from its lists one by one; eight of ten objects are in each."""
+    told, truth = bench_fusion.scene(50, 4, 20)
+    lists = [told.lists.of(0, f) for f in range(80)]
+    units = [told.units[u] for u in told.unit_ix]
+    plain = reports_of([lists], units, told.captured_s.tolist(), told.arrives_s.tolist())
+    for name in ("unit_ix", "captured_s", "arrives_s", "issue_s", "newest", "arrived", "arrived_start"):
+        assert getattr(told, name).tolist() == getattr(plain, name).tolist(), name
+    assert told.lists.start.tolist() == plain.lists.start.tolist()
+    assert told.lists.entries.tobytes() == plain.lists.entries.tobytes()
+    assert told.lists.start[0, -1] == pytest.approx(0.8 * 4000, abs=4 * np.sqrt(4000 * 0.8 * 0.2))
+    assert truth[0].max() < 10 * np.sqrt(50)
+
+
+def test_only_equal_results_are_raced(monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = bench_fusion.gnn_vs_numpy(once, (5,))
+    assert line["gnn_vs_numpy"] > 0
+    assert 0 <= line["max_dx_m"] < 1e-9
+    plain = bench_fusion.gnn_oracle.fuse
+    monkeypatch.setattr(bench_fusion.gnn_oracle, "fuse", lambda told, gate: plain(told, gate=0.5))
+    with pytest.raises(AssertionError):
+        list(bench_fusion.gnn_vs_numpy(once, (5,)))
+
+
+def test_stone_soup_is_a_peer_where_it_is_installed() -> None:
+    """GOSPA is equal; tracks are alike: about as many as objects, and near them."""
+    pytest.importorskip("stonesoup")
+    (line,) = bench_fusion.gospa_vs_stonesoup(once, 5)
+    assert line["gospa_vs_stonesoup"] > 0
+    assert line["max_difference_m"] < 1e-9
+    (line,) = bench_fusion.tracker_vs_stonesoup(once, 1, 3)
+    assert line["tracker_vs_stonesoup"] > 0
+    for who in ("", "stonesoup_"):
+        assert 14 <= line[f"{who}tracks"] <= 20
+        assert 0 < line[f"{who}nearest_rmse_m"] < 1
+        assert line[f"{who}nearest_rmse_m"] < line[f"{who}gospa_m"]
+
+
+def test_without_stone_soup_a_line_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "stonesoup"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "stonesoup", None)
+    why = "stonesoup is not installed: pip install '.[bench]'"
+    assert list(bench_fusion.gospa_vs_stonesoup(once)) == [{"gospa_vs_stonesoup": None, "why": why}]
+    assert list(bench_fusion.tracker_vs_stonesoup(once)) == [{"tracker_vs_stonesoup": None, "why": why}]
+
+
+def test_paper_counts_and_what_stands_beside_them() -> None:
+    """The six counts of the paper's table, and its intervals as in the published rates (Wilson, four digits)."""
+    assert paper.PASSED == {"GT": 500, "PEM": 426, "coPEM:0s": 499, "coPEM:0.5s": 474, "coPEM:1s": 323, "coPEM:1.5s": 0}
+    ours = pd.DataFrame({"configuration": list(paper.PASSED), "pass_share": 0.5, "pass_share_exact": 0.86})
+    table = paper.beside(ours)
+    assert table["paper"].tolist() == pytest.approx([1.0, 0.852, 0.998, 0.948, 0.646, 0.0])
+    assert table["paper 95 %"].tolist() == [
+        "[0.9924, 1.0000]", "[0.8182, 0.8804]", "[0.9888, 0.9996]", "[0.9249, 0.9643]", "[0.6031, 0.6867]",
+        "[0.0000, 0.0076]",
+    ]  # fmt: skip
+    assert table["exact within"].tolist() == ["no", "yes", "no", "no", "no", "no"]
+
+
+def test_misfit_by_hand() -> None:
+    """None at the paper's own rates; at .5 everywhere 2 n log 2 for each of the three with all or none."""
+    rates = {name: passed / paper.RUNS for name, passed in paper.PASSED.items()}
+    assert calibrate_tc016d.misfit(rates) == pytest.approx(0.0, abs=1e-6)
+    halved = calibrate_tc016d.misfit(rates | {"GT": 0.5, "coPEM:1.5s": 0.5})
+    assert halved == pytest.approx(2 * 2 * 500 * np.log(2))
+
+
+@pytest.mark.long
+def test_calibration_is_what_the_page_says_and_the_experiment_has() -> None:
+    """The fit again: the same page; its parameters are those of the experiment and of the recording."""
+    page = calibrate_tc016d.page()
+    assert page == (ROOT / "docs/calibration.md").read_text(encoding="utf-8")
+    experiment, _ = problems(load(ROOT / "logs/tc016d.yaml"))
+    assert experiment is not None
+    assert experiment.braking is not None
+    driver = experiment.braking.driver.model_dump()
+    assert f"| `a_max_mps2`, full braking | {driver['a_max_mps2']:g} m/s² |" in page
+    assert f"shape of the gamma distribution | {driver['reaction']['shape']:g} |" in page
+    assert f"| reaction, mean | {driver['reaction']['mean_s']:g} s |" in page
+    assert f"| road side of the truck | y = {make_logs.TC016D_TRUCK_EDGE_M:g} m |" in page
+
+
+def test_the_table_is_the_papers() -> None:
+    """Each exact rate within the paper's Wilson interval, in its order; the sample within 99 % of its own."""
+    experiment, _ = problems(load(ROOT / "logs/tc016d.yaml"))
+    assert experiment is not None
+    assert (experiment.runs, experiment.seed) == (500, 1)
+    recordings, _ = read_logs(experiment, [ROOT / "logs/tc016d.mcap"], None)
+    times = experiment.measure.model_copy(update={"accuracy": False})
+    rows = run(experiment.model_copy(update={"measure": times}), recordings).summary.set_index("configuration")
+    exact = rows["pass_share_exact"]
+    for name, passed in paper.PASSED.items():
+        low, high = wilson(passed, paper.RUNS)
+        assert low <= exact[name] <= high, name
+        at_least, at_most = binom.interval(0.99, 500, exact[name]) if exact[name] > 0 else (0, 0)
+        assert at_least <= rows["pass_share"][name] * 500 <= at_most, name
+    order = ["GT", "coPEM:0s", "coPEM:0.5s", "PEM", "coPEM:1s", "coPEM:1.5s"]
+    assert (np.diff([exact[name] for name in order]) <= 1e-12).all()
+
+
+def test_a_long_recording_is_timed(tmp_path: Path) -> None:
+    """Here it is short: what grows how is for the benchmark to say."""
+    short, longer, slope = bench_long.long(tmp_path, minutes=(0.05, 0.1), objects=8)
+    assert (short["object_states"], longer["object_states"]) == (240, 480)
+    assert all(value > 0 for line in (short, longer, slope) for value in line.values())

@@ -1,0 +1,96 @@
+"""What is opened in the real viewer: all views there, none complaining, boxes when and where there should be some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import InputError
+from copem_replay.viewer import check_viewer, write_rrd
+from tests.helpers.viewer import Viewer, free_port, headless_viewer
+from tests.viewer.test_rrd import CHANGES, SUMMARY, Made, approaching, make, rerun, rows
+
+VIEWS = {
+    *CHANGES["configurations"],
+    "What each knows, when",
+    "GOSPA [m]",
+    "Measured objects known",
+    "What difference it made",
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return make(tmp_path_factory.mktemp("viewer") / "replay.rrd", approaching(), **CHANGES)
+
+
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[Viewer]:
+    with headless_viewer() as opened:
+        yield opened
+
+
+def share_of(picture: np.ndarray, colour: tuple[int, int, int]) -> float:
+    """How much of a picture has a colour's hue: bright and dark of it, on what is nearly black."""
+    pixels = picture.reshape(-1, 3).astype(float)
+    bright = np.linalg.norm(pixels, axis=1)
+    direction = np.array(colour) / np.linalg.norm(colour)
+    return float(((bright > 40) & (pixels @ direction > 0.985 * bright)).mean())
+
+
+def test_the_file_as_an_engineer_sees_it(made: Made, viewer: Viewer) -> None:
+    viewer.open(made.path)
+    assert viewer.views() >= VIEWS
+    colours = configuration_colours(made.beliefs)
+    # Three instants: before the late configuration has a list, when it has some, after the car has left.
+    for elapsed_s, believed in ((0.3, {"GT": 3, "GT late": 0}), (2.0, {"GT": 3, "GT late": 3}), (4.8, {"GT": 2})):
+        viewer.seek(elapsed_s)
+        for name, count in believed.items():
+            # What was computed, what is in the file, what is in the picture.
+            fused = made.beliefs[name].fused
+            frame = np.searchsorted(fused.arrives_s[0], elapsed_s + 1e-6, side="right") - 1
+            listed = np.flatnonzero((fused.frame_ix == frame) & fused.valid[0])
+            assert len(listed) == count
+            entity = f"/world/{name}/boxes".replace(" ", "\\ ")
+            newest = [row for row in rows(made.path, entity) if row["elapsed"] <= elapsed_s * 1e9 + 1000][-1:]
+            places = [tuple(place[:2]) for row in newest for place in row["Boxes3D:centers"]]
+            expected = zip(fused.x_m[0, listed], fused.y_m[0, listed], strict=True)
+            assert places == [pytest.approx(place, abs=1e-4) for place in expected]
+            drawn = share_of(viewer.picture(name), colours[name])
+            assert (drawn > 3e-4) == (count > 0), f"{name} at {elapsed_s} s: {drawn}"
+    whole = viewer.picture()
+    assert len(np.unique(whole.reshape(-1, 3), axis=0)) > 100
+    assert viewer.errors() == []
+
+
+def test_sent_to_a_viewer_that_runs(made: Made, viewer: Viewer, tmp_path: Path) -> None:
+    check_viewer(viewer.url)
+    fewer = {name: made.beliefs[name] for name in ("GT", "PEM")}
+    path = tmp_path / "live.rrd"
+    said = write_rrd(path, made.replay, made.given, [fewer], made.table, SUMMARY, 3, viewer=viewer.url)
+    assert said == []
+    viewer.wait({"GT", "PEM"})
+    assert {"/world/GT/boxes", "/world/PEM/boxes", "/world/PEM/status", "/plots/gospa/PEM"} <= viewer.entities()
+    assert viewer.views() & {"GT late", "pole"} == set(), "the layout that was sent, not the one before"
+    assert viewer.errors() == []
+    made.write(tmp_path / "alone.rrd", beliefs=fewer)
+    assert rerun("rrd", "compare", "--unordered", path, tmp_path / "alone.rrd").returncode == 0
+
+
+def test_a_viewer_that_goes_leaves_the_file_complete(made: Made, tmp_path: Path) -> None:
+    path, url = tmp_path / "x.rrd", f"rerun+http://127.0.0.1:{free_port()}/proxy"
+    said = write_rrd(path, made.replay, made.given, [made.beliefs], made.table, SUMMARY, 3, viewer=url)
+    assert said == [f"x.rrd: the viewer at {url} went before it had everything; the file is complete"]
+    assert rerun("rrd", "compare", "--unordered", path, made.path).returncode == 0
+
+
+def test_where_no_viewer_is_or_can_be() -> None:
+    with pytest.raises(InputError, match=r"--live: no viewer at .*refused.*; start one first: python -m rerun"):
+        check_viewer(f"rerun+http://127.0.0.1:{free_port()}/proxy")
+    for wrong in ("127.0.0.1:9876", "http://127.0.0.1:9876/proxy", "rerun+http://host:99999999/proxy", "rerun://h/x"):
+        with pytest.raises(InputError, match="--viewer: expected an address such as"):
+            check_viewer(wrong)
