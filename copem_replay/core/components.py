@@ -15,6 +15,7 @@ from importlib.metadata import entry_points
 from typing import Annotated, Any, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -87,6 +88,21 @@ def _identifier(value: object) -> object:
 
 
 Id = Annotated[str, BeforeValidator(_identifier), WithJsonSchema({"type": ["string", "integer"]})]
+
+Pair = tuple[Number, Number]
+
+
+def _covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
+    (a, b), (c, d) = value
+    scale = max(abs(a), abs(d), 1e-12)
+    if abs(b - c) > 1e-9 * scale:
+        raise ValueError(f"expected a symmetric matrix, found {b} and {c} off the diagonal")
+    if a < 0 or d < 0 or a * d - b * c < -1e-9 * scale**2:
+        raise ValueError(f"expected a positive semi-definite matrix, found [[{a}, {b}], [{c}, {d}]]")
+    return value
+
+
+Covariance = Annotated[tuple[Pair, Pair], AfterValidator(_covariance)]
 
 
 class Slot:

@@ -10,14 +10,13 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from copem_replay.core.components import Count, Frozen, Id, NotNegative, Number, Positive, Share, Slot
+from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
-from copem_replay.io.schemas.object_lists import Fields
-from copem_replay.metrics.braking.driver import DRIVERS, Driver
-from copem_replay.metrics.config import Margin, Measure
-from copem_replay.perception.pem.condition import ClassNames, Pem
-from copem_replay.perception.pem.error import Covariance
+from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
+from copem_replay.metrics.config import Braking, Measure
+from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
+from copem_replay.perception.pem.condition import Pem
 
 
 def _unit_name(value: str) -> str:
@@ -47,72 +46,15 @@ def _configuration_name(value: str) -> str:
 
 UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
-Point = tuple[Number, Number]
 
 
-def _two(value: object) -> object:
-    if isinstance(value, list | tuple) and len(value) == 3:
-        found = ", ".join(str(number) for number in value)
-        raise ValueError(f"expected two numbers, in the plane, found [{found}]; the height above ground is `height_m`")
-    return value
+class Unit(Placement):
+    """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
-
-InPlane = Annotated[Point, BeforeValidator(_two)]
-"""A point beside which a height may stand."""
-
-
-Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
-"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
-
-
-Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
-"""Lists per second."""
-
-
-class Carriers(Frozen):
-    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability `share`."""
-
-    classes: ClassNames
-    share: Share
-
-
-def _what_carries(value: object) -> str:
-    return "carriers" if isinstance(value, dict | Carriers) else "id"
-
-
-On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], Discriminator(_what_carries)]
-
-
-class Recorded(Frozen):
-    """Lists as they were recorded in the log, on a topic of osi3.SensorData, instead of a PEM.
-
-    `delay_s`: how long before its stamp a list was captured, where its messages don't say; `covariance_m2` of its
-    positions and `existence` of its entries likewise.
+    One whose lists are recorded has no PEM, and needs a place only where distances are measured from it.
     """
 
-    topic: Annotated[str, Field(min_length=1)]
-    delay_s: Latency = 0.0
-    covariance_m2: Covariance | None = None
-    existence: Share = 0.9
-
-
-class Unit(Frozen):
-    """A perception unit: carried `on` the ego, another object or a share of some classes, or standing `at` a place.
-
-    `height_m` above the ground; left out, a carried unit is on the roof. One whose lists are `recorded` has no PEM, and
-    needs a place only where distances are measured from it.
-    """
-
-    on: On | None = None
-    at: InPlane | None = None
-    offset_m: InPlane = (0.0, 0.0)
-    yaw_deg: Number = 0.0
-    height_m: NotNegative | None = None
-    ground_z_m: Number | None = None
-    pem: Id | None = None
     recorded: Recorded | None = None
-    rate_hz: Rate | None = None
-    phase_s: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _place(self) -> Self:
@@ -133,34 +75,6 @@ class Unit(Frozen):
         return self
 
 
-_AROUND = "the corners in order around an area, each once"
-
-
-def _crooked(reason: str) -> str:
-    """What is wrong with a polygon, of which shapely says `Self-intersection[5 5]`."""
-    what, _, place = reason.rstrip("]").partition("[")
-    at = f" at [{', '.join(place.split())}]" if place else ""
-    words = {"Self-intersection": f"edges that cross or overlap{at}", "Ring Self-intersection": f"edges that meet{at}"}
-    return words.get(what, "corners without an area between them")
-
-
-class Obstacle(Frozen):
-    """A static obstacle beside those in the log."""
-
-    polygon_m: Annotated[tuple[Point, ...], Field(min_length=3)]
-    height_m: Positive
-    ground_z_m: Number | None = None
-
-    @model_validator(mode="after")
-    def _simple(self) -> Self:
-        import shapely
-
-        polygon = shapely.Polygon(self.polygon_m)
-        if not polygon.is_valid or polygon.area <= 0:
-            raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
-        return self
-
-
 class Configuration(Frozen):
     """What is compared: which units, which fusion, which latency."""
 
@@ -174,19 +88,6 @@ class Configuration(Frozen):
         if isinstance(self.latency_s, dict):
             return self.latency_s.get(unit, self.latency_s.get("default", 0.0))
         return self.latency_s
-
-
-class Braking(Frozen):
-    """What the ego's declared driver does when an object is known (`brakes_for: object`) or seen to be in its way.
-
-    `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (whoever was recorded may
-    have braked already).
-    """
-
-    driver: Annotated[Driver, Slot("driver", DRIVERS)]
-    margin_m: Margin = 0.5
-    ego: Literal["recorded", "constant_speed"] = "recorded"
-    brakes_for: Literal["object", "conflict"] = "object"
 
 
 def _how_many(value: object) -> object:
@@ -255,37 +156,12 @@ class Sweep(Frozen):
         return chosen
 
 
-class Read(Frozen):
-    """How the truth is found in a recording that holds several object lists."""
-
-    topic: str | None = None
-
-
-class ReadFields(Fields):
-    """How the truth is read from a topic of a schema that is not known by name: which of its fields are what."""
-
-    topic: Annotated[str, Field(min_length=1)]
-
-
 def _how_read(value: object) -> str:
     named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
     return "fields" if named else "topic"
 
 
 HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
-
-
-class EgoTopic(Frozen):
-    """An ego that is no object of any list: its poses are on a topic (odometry, stamped poses, transforms).
-
-    `size_m`: length, width, height. `centre_from_rear_axle_m`: how far ahead of its poses, which are on the ground, the
-    centre of its box is. `frame`: whose poses, where the topic has those of several.
-    """
-
-    topic: Annotated[str, Field(min_length=1)]
-    size_m: tuple[Positive, Positive, Positive] | None = None
-    centre_from_rear_axle_m: Number | None = None
-    frame: str | None = None
 
 
 def _what_ego(value: object) -> str:

@@ -19,7 +19,7 @@ from copem_replay.core.errors import RecordingError
 from copem_replay.core.interpolation import at_instants
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, joined
-from copem_replay.experiment.schema import Recorded
+from copem_replay.io.config import Recorded
 from copem_replay.io.recorded_lists import read_listed
 from copem_replay.io.recorded_osi import RecordedLists, read_recorded
 from copem_replay.io.recording import Recording

@@ -24,7 +24,7 @@ from copem_replay.io.schemas.decoded import Columns
 from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
 
 if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
-    from copem_replay.experiment.schema import EgoTopic
+    from copem_replay.io.config import EgoTopic
     from copem_replay.io.recorded_osi import RecordedLists
     from copem_replay.io.schemas.object_lists import Fields
     from copem_replay.io.world_frame import Surroundings

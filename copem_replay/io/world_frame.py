@@ -25,7 +25,7 @@ from copem_replay.io.schemas.registry import definition_of, description_of, is_l
 from copem_replay.io.transforms import Course, Frames, course_of
 
 if TYPE_CHECKING:
-    from copem_replay.experiment.schema import EgoTopic
+    from copem_replay.io.config import EgoTopic
 
 EGO = "ego"
 """Id of an ego that is no object of any list."""

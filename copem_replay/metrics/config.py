@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, Literal, Protocol, Self
 
 from pydantic import Field, model_validator
 
-from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Share
+from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Share, Slot
+from copem_replay.metrics.braking.driver import DRIVERS, Driver
+from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import ClassNames
 
 
@@ -124,3 +127,32 @@ class Measure(Frozen):
     exact: Flag = False
     accuracy: Flag = True
     gospa: Gospa = Gospa()
+
+
+class Braking(Frozen):
+    """What the ego's declared driver does when an object is known (`brakes_for: object`) or seen to be in its way.
+
+    `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (whoever was recorded may
+    have braked already).
+    """
+
+    driver: Annotated[Driver, Slot("driver", DRIVERS)]
+    margin_m: Margin = 0.5
+    ego: Literal["recorded", "constant_speed"] = "recorded"
+    brakes_for: Literal["object", "conflict"] = "object"
+
+
+class MetricsSetup(PerceptionSetup, Protocol):
+    """What metrics read of an experiment."""
+
+    @property
+    def measure(self) -> Measure:
+        """What is measured."""
+
+    @property
+    def braking(self) -> Braking | None:
+        """What the declared driver does, if asked."""
+
+    @property
+    def recorded(self) -> Mapping[str, object]:
+        """Units whose lists are recorded."""

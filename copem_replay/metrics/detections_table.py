@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
-from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import delays_of
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import Verdicts, judge
+from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.episodes import ENDED_BY, Looks, Reference, reference_at
 from copem_replay.perception.visibility import rectangles
@@ -46,7 +46,7 @@ class Events:
 def table(
     scene: Scene,
     truth: Tracks,
-    experiment: Experiment,
+    experiment: MetricsSetup,
     found: Looks,
     meeting: Sequence[Encounter],
     runs: Int,
@@ -68,7 +68,7 @@ def table(
 
 
 def _columns(
-    scene: Scene, truth: Tracks, experiment: Experiment, found: Looks, runs: Int, configuration: str, known: Events
+    scene: Scene, truth: Tracks, experiment: MetricsSetup, found: Looks, runs: Int, configuration: str, known: Events
 ) -> dict[str, Any]:
     """Columns (S · M,) of one configuration: what was known, when and how far away."""
     S, M = len(runs), len(found.object_ix)
@@ -112,7 +112,7 @@ def _columns(
     return columns
 
 
-def _delays(scene: Scene, experiment: Experiment, found: Looks, runs: Int) -> Float | None:
+def _delays(scene: Scene, experiment: MetricsSetup, found: Looks, runs: Int) -> Float | None:
     """(S, M) seconds the driver takes to react to each object, the same in every configuration. None without braking.
 
     Addressed by the object and the onset's stamp: what is reacted to, not when it came to be known.
@@ -127,7 +127,7 @@ def _delays(scene: Scene, experiment: Experiment, found: Looks, runs: Int) -> Fl
 
 
 def _braking(
-    experiment: Experiment, found: Looks, meeting: Sequence[Encounter], delay_s: Float, known: Events
+    experiment: MetricsSetup, found: Looks, meeting: Sequence[Encounter], delay_s: Float, known: Events
 ) -> dict[str, Any]:
     """Columns (S · M,) of one configuration: the verdicts of the looks in conflict; null for the others."""
     braking = experiment.braking
@@ -157,7 +157,7 @@ def _braking(
 
 
 def distances(
-    scene: Scene, truth: Tracks, experiment: Experiment, object_ix: Int, time_s: Float
+    scene: Scene, truth: Tracks, experiment: MetricsSetup, object_ix: Int, time_s: Float
 ) -> tuple[Float, Float]:
     """Centre distance and gap of objects (K,) at times (K,); NaN where the time is, or where one is absent.
 

@@ -14,8 +14,8 @@ import numpy as np
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import states_at, wrap
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
-from copem_replay.experiment.schema import Carriers, Experiment
-from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, Measure, StartsMoving
+from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, Measure, MetricsSetup, StartsMoving
+from copem_replay.perception.config import Carriers
 from copem_replay.perception.sensor_poses import carrier, moved, observers, poses, unit_ground
 from copem_replay.perception.visibility import Statics, visible_shares
 
@@ -64,7 +64,7 @@ def measured_objects(scene: Scene, measure: Measure) -> Int:
     return np.flatnonzero(chosen)
 
 
-def reference_at(scene: Scene, truth: Tracks, experiment: Experiment, time_s: Float) -> Reference:
+def reference_at(scene: Scene, truth: Tracks, experiment: MetricsSetup, time_s: Float) -> Reference:
     """The place distances are measured from, at times (K,). Raises ExperimentError when there is none."""
     n = len(time_s)
     name = experiment.measure.distance_to
@@ -92,7 +92,7 @@ def _state(
     return states_at(truth, np.full(len(time_s), object_ix), time_s, t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
 
 
-def looks(scene: Scene, truth: Tracks, static: Statics, experiment: Experiment) -> Looks:
+def looks(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup) -> Looks:
     """Onset and end of every measured object that has an onset (`truth`: the world at its own frames)."""
     measure = experiment.measure
     wanted = np.isin(truth.object_ix, measured_objects(scene, measure))
@@ -143,7 +143,7 @@ def _first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
 
 
 def _condition(
-    scene: Scene, truth: Tracks, wanted: Bool, world: Tracks, static: Statics, experiment: Experiment
+    scene: Scene, truth: Tracks, wanted: Bool, world: Tracks, static: Statics, experiment: MetricsSetup
 ) -> Bool:
     """(P,) where the onset's condition holds, row by row of `world`, the measured tracks of `truth`."""
     onset = experiment.measure.onset
@@ -163,7 +163,7 @@ def _condition(
     raise TypeError(f"onset {onset!r}")
 
 
-def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: Experiment, from_: str) -> Float:
+def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSetup, from_: str) -> Float:
     """(P,) distance of each row, infinite where there is nothing to measure from."""
     per_frame = reference_at(scene, truth, experiment, truth.captured_s)
     f = world.frame_ix
@@ -176,7 +176,7 @@ def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: Experiment
     return np.where(per_frame.present[f], distance, np.inf)
 
 
-def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: Experiment, *, ego_only: bool) -> Float:
+def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup, *, ego_only: bool) -> Float:
     """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
 
     Units that only some runs have do not count: an onset is the same in all of them.

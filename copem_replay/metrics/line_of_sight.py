@@ -5,10 +5,12 @@ In sight is what shows: a visible share above 0, in a list of a modelled unit, w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.episodes import Looks
 from copem_replay.perception.observation import Candidates
 
@@ -29,13 +31,12 @@ def first_sights(found: Candidates, looks: Looks) -> Float:
     return first_s
 
 
-def in_sight_s(first_s: Float, experiment: Experiment, configuration: Configuration, equipped: Bool | None) -> Float:
-    """(S | 1, M) when any unit of a configuration first has each look in sight.
+def in_sight_s(first_s: Float, experiment: MetricsSetup, names: Sequence[str], equipped: Bool | None) -> Float:
+    """(S | 1, M) when any of some units, `names`, first has each look in sight.
 
     NaN: never, or not known, of the truth and with recorded units. `first_s` as from `first_sights`; `equipped (S, U)`:
     which of the experiment's units there are in each run, None: all.
     """
-    names = experiment.units_of(configuration)
     unknown = np.full((1, first_s.shape[1]), np.nan)
     if not names or any(name in experiment.recorded for name in names):
         return unknown

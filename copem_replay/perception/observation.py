@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
+from copem_replay.core.time_chunk import Stretch
 from copem_replay.core.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
 from copem_replay.core.view_geometry import Look
-from copem_replay.experiment.schema import Experiment
+from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import applies
 from copem_replay.perception.pem.detection import probability_of
 from copem_replay.perception.sensor_poses import Placed, Poses, observers, place
 from copem_replay.perception.visibility import visible_shares
-from copem_replay.pipeline.chunking import Stretch
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def joined_stretches(pieces: Sequence[Candidates]) -> Candidates:
 def candidates(
     scene: Scene,
     truth: Tracks,
-    experiment: Experiment,
+    experiment: PerceptionSetup,
     placed: Placed | None = None,
     *,
     from_s: float = -np.inf,
@@ -133,7 +133,9 @@ def candidates(
     return Candidates(tracks, look, *_assess(tracks, look, experiment))
 
 
-def could_meet(scene: Scene, truth: Tracks, experiment: Experiment, placed: Placed, cut: Sequence[Stretch]) -> Bool:
+def could_meet(
+    scene: Scene, truth: Tracks, experiment: PerceptionSetup, placed: Placed, cut: Sequence[Stretch]
+) -> Bool:
     """(U,) whether an object ever has range, azimuth and class of a condition of each unit's PEM, seen or hidden.
 
     Without a look at who hides whom: what is never met here, no replay meets. `cut`: the stretches of the log.
@@ -156,7 +158,7 @@ def could_meet(scene: Scene, truth: Tracks, experiment: Experiment, placed: Plac
 
 
 def _worlds(
-    scene: Scene, truth: Tracks, experiment: Experiment, placed: Placed, from_s: float, until_s: float
+    scene: Scene, truth: Tracks, experiment: PerceptionSetup, placed: Placed, from_s: float, until_s: float
 ) -> Iterator[tuple[list[str], Tracks]]:
     """The world at the lists of the units, once for all units that have theirs at the same instants."""
     together: dict[bytes, list[str]] = {}
@@ -215,7 +217,7 @@ def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple
     return tracks, look
 
 
-def _assess(tracks: Tracks, look: Look, experiment: Experiment) -> tuple[Int, Float, Float]:
+def _assess(tracks: Tracks, look: Look, experiment: PerceptionSetup) -> tuple[Int, Float, Float]:
     """Which couple of its unit's PEM applies to each row, the probability it gives, and the existence it claims."""
     couple_ix = np.full(len(tracks.frame_ix), -1)
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))

@@ -14,7 +14,7 @@ import numpy as np
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
-from copem_replay.experiment.schema import Experiment
+from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.observation import Candidates
 from copem_replay.perception.pem.error import errors_of
 
@@ -25,7 +25,7 @@ SMALLEST_SIZE_M = 0.05
 def perceive(
     scene: Scene,
     found: Candidates,
-    experiment: Experiment,
+    experiment: PerceptionSetup,
     runs: Int,
     *,
     states: Literal["true", "expected", "sampled"] = "sampled",
@@ -68,7 +68,7 @@ class _Draws:
         )
 
 
-def _with_errors(seen: Tracks, found: Candidates, experiment: Experiment, draws: _Draws) -> Tracks:
+def _with_errors(seen: Tracks, found: Candidates, experiment: PerceptionSetup, draws: _Draws) -> Tracks:
     S, P = seen.valid.shape
     columns: dict[str, Any] = {}
 

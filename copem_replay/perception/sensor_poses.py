@@ -9,7 +9,7 @@ import numpy as np
 
 from copem_replay.core.interpolation import at_instants, wrap
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
-from copem_replay.experiment.schema import Experiment, Obstacle, Unit
+from copem_replay.perception.config import Obstacle, PerceptionSetup, Placement
 from copem_replay.perception.visibility import NO_STATICS, Observers, Statics, statics
 
 GROUND_WITHIN_M = 50.0
@@ -38,7 +38,7 @@ class Placed:
     notes: tuple[str, ...]
 
 
-def place(scene: Scene, truth: Tracks, experiment: Experiment) -> Placed:
+def place(scene: Scene, truth: Tracks, experiment: PerceptionSetup) -> Placed:
     """Where the units of an experiment are over one log (`truth`: the world at its own frames)."""
     notes: list[str] = []
     static = place_obstacles(truth, experiment.obstacles, notes)
@@ -54,7 +54,7 @@ def place(scene: Scene, truth: Tracks, experiment: Experiment) -> Placed:
     return Placed(stamps, there, carriers, static, tuple(notes))
 
 
-def list_instants(scene: Scene, truth: Tracks, unit: Unit) -> Int:
+def list_instants(scene: Scene, truth: Tracks, unit: Placement) -> Int:
     """(F,) capture stamps of a unit's lists: the frames of the truth, or t0 + phase + k / rate within the log."""
     if unit.rate_hz is None:
         return truth.stamp_ns
@@ -66,7 +66,7 @@ def list_instants(scene: Scene, truth: Tracks, unit: Unit) -> Int:
     return stamps
 
 
-def poses(scene: Scene, unit: Unit, world: Tracks, ground_m: float) -> Poses:
+def poses(scene: Scene, unit: Placement, world: Tracks, ground_m: float) -> Poses:
     """Where a unit is at each list of `world`, which holds its carrier at the unit's list instants."""
     n = len(world.stamp_ns)
     if unit.at is not None:
@@ -105,14 +105,14 @@ def observers(places: Sequence[Poses], carriers: Int) -> Observers:
     )
 
 
-def mounting_height(scene: Scene, truth: Tracks, unit: Unit) -> float:
+def mounting_height(scene: Scene, truth: Tracks, unit: Placement) -> float:
     """Metres a unit is above the ground: as given, or the height of its carrier when that first appears."""
     if unit.height_m is not None:
         return unit.height_m
     return float(truth.height_m[0, np.flatnonzero(truth.row_object_ix == carrier(scene, unit))[0]])
 
 
-def carrier(scene: Scene, unit: Unit) -> int:
+def carrier(scene: Scene, unit: Placement) -> int:
     """Index of the object that carries a unit, −1 for a fixed place."""
     if unit.on is None:
         return -1
@@ -133,7 +133,7 @@ def ground_at(truth: Tracks, corners: Float) -> float | None:
     return float(truth.z_m[0, nearest] - truth.height_m[0, nearest] / 2)
 
 
-def unit_ground(truth: Tracks, name: str, unit: Unit, notes: list[str]) -> float:
+def unit_ground(truth: Tracks, name: str, unit: Placement, notes: list[str]) -> float:
     """Ground under a fixed unit; 0 for a carried one, which brings its own. What was assumed goes to `notes`."""
     if unit.at is None:
         return 0.0

@@ -8,13 +8,13 @@ cut is. Where the cuts are changes no result, and a log that is not long is one 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from copem_replay.communication.arrivals import instants
 from copem_replay.core.interpolation import AROUND_S
+from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import Float, Scene, Tracks
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.fusion.base import ListFusion
@@ -28,17 +28,6 @@ ROWS_HELD = 4_000_000
 """What needs all of a log at once gets it where it has at most so many (chosen: some GB)."""
 _AFTER = 0.381966
 """Where between two frames a cut is (chosen: hardly any latency brings a list there)."""
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Instants from `from_s` on and before `until_s`, in seconds of the log."""
-
-    from_s: float = -np.inf
-    until_s: float = np.inf
-
-
-WHOLE = Stretch()
 
 
 def stretches(scene: Scene, truth: Tracks, experiment: Experiment) -> tuple[Stretch, ...]:

@@ -13,7 +13,8 @@ import numpy as np
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
-from copem_replay.experiment.schema import Carriers, Configuration, Experiment, Unit
+from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.perception.config import Carriers
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from copem_replay.communication.arrivals import instants
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.interpolation import at_instants
+from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recorded_units import RecordedUnits, recorded_units
@@ -30,7 +31,7 @@ from copem_replay.metrics.episodes import Looks, looks
 from copem_replay.metrics.line_of_sight import first_sights, in_sight_s
 from copem_replay.perception.observation import Candidates, KeptShares, candidates, joined_stretches
 from copem_replay.perception.sensor_poses import Placed, place
-from copem_replay.pipeline.chunking import ROWS_A_STRETCH, ROWS_HELD, WHOLE, Reach, Stretch, candidate_rows, stretches
+from copem_replay.pipeline.chunking import ROWS_A_STRETCH, ROWS_HELD, Reach, candidate_rows, stretches
 from copem_replay.pipeline.conversions import as_belief
 from copem_replay.pipeline.expansion import Fleet, fleet_of
 from copem_replay.pipeline.receiver import Believed, Receivers, World, by_truth, listen, seen_by_all
@@ -328,7 +329,7 @@ def _in_sight(replay: Replay, experiment: Experiment, equipped: Bool | None, the
     equipped = equipped if there is None else there[None]
     fleet = fleet_of(experiment, replay.scene).experiment
     return {
-        name: in_sight_s(replay.first_sights_s, fleet, configuration, equipped)
+        name: in_sight_s(replay.first_sights_s, fleet, fleet.units_of(configuration), equipped)
         for name, configuration in fleet.configurations.items()
     }
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool
-from copem_replay.experiment.schema import Carriers, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.config import At
 from copem_replay.metrics.episodes import measured_objects
+from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import could_meet
 from copem_replay.pipeline.log_replay import Replay
 

@@ -14,6 +14,7 @@ from copem_replay.communication.link import transmit
 from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.object_list import Lists
 from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
@@ -22,7 +23,6 @@ from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
 from copem_replay.io.recorded_units import RecordedUnits
 from copem_replay.perception.observation import Candidates
 from copem_replay.perception.perceive import perceive
-from copem_replay.pipeline.chunking import WHOLE, Stretch
 from copem_replay.pipeline.conversions import as_lists
 
 States = Literal["true", "expected", "sampled"]

@@ -11,8 +11,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.schema import Carriers, Configuration, Experiment, SweptBy, Unit
+from copem_replay.experiment.schema import Configuration, Experiment, SweptBy, Unit
 from copem_replay.metrics.config import Measure
+from copem_replay.perception.config import Carriers
 
 KINDS = ("latency_s", "rate_hz", "units", "share")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,45 +13,16 @@ from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.metrics.gospa import gospa
-from copem_replay.perception.observation import Candidates
-from copem_replay.perception.sensor_poses import carrier
 from copem_replay.pipeline.log_replay import Replay
 from copem_replay.pipeline.scoring import settings_of
+from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve
 from copem_replay.viewer.boxes import EGO
 from copem_replay.viewer.sink import Out, by_frame, elapsed_ns, part_of
-
-BY_EGO, BY_ANY = "ego", "any unit"
-"""Whose share a curve is: the best of the ego's units, the best of all."""
 
 LISTS_AT_ONCE = 2_000
 """For so many lists the truth is interpolated at a time (chosen)."""
 
 _LOOKS = {BY_EGO: (EGO, 3.0), BY_ANY: (TRUTH, 1.5)}
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Visible share of one object at instants (K,); NaN where no unit has a list of it."""
-
-    elapsed_ns: Int
-    share: Float
-
-
-def share_curves(replay: Replay, experiment: Experiment, found: Candidates, object_ix: int) -> dict[str, Curve]:
-    """By whom an object is seen, and how much of it; nobody's curve is left out. `found`: its rows, at least."""
-    scene, tracks = replay.scene, found.tracks
-    stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
-    carriers = np.array([carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
-    own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
-    share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
-    rows = np.flatnonzero(tracks.row_object_ix == object_ix)
-    share[tracks.frame_ix[rows]] = found.look.visible_share[rows]
-    # A unit without a list of the object says nothing about it: the best of the others counts.
-    return {
-        whose: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
-        for whose, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
-        if units.any()
-    }
 
 
 def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
@@ -68,19 +38,6 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
         out.columns(path, curve.elapsed_ns[kept], values)
         colour, width = _LOOKS[whose]
         out.static(path, rr.SeriesLines(names=whose, colors=colour, widths=width))
-
-
-def _newest_lists(tracks: Tracks, max_gap_s: float) -> tuple[Int, Int]:
-    """All capture instants (K,), and the newest list of each unit at each (U, K): −1, none for `max_gap_s`."""
-    stamps = np.unique(tracks.stamp_ns)
-    newest = np.full((len(tracks.units), len(stamps)), -1)
-    for unit in range(len(tracks.units)):
-        mine = np.flatnonzero(tracks.frame_unit_ix == unit)  # in order of capture
-        at = np.searchsorted(tracks.stamp_ns[mine], stamps, side="right") - 1
-        known = at >= 0
-        known[known] = stamps[known] - tracks.stamp_ns[mine[at[known]]] <= max_gap_s * 1e9
-        newest[unit, known] = mine[at[known]]
-    return stamps, newest
 
 
 def position_errors(

@@ -15,6 +15,7 @@ from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.visibility_curves import share_curves
 from copem_replay.viewer import (
     blueprint as layout,
 )
@@ -142,7 +143,7 @@ def _world(
         marks.detections(out, replay, experiment, table, name, shown, colour)
     rows = replay.rows_of(np.array(shown, dtype=np.int64))
     for k in shown:
-        curves = plots.share_curves(replay, experiment, rows, k)
+        curves = share_curves(replay, experiment, rows, k)
         plots.visible_share(out, scene.object_ids[k], curves)
         marks.on_curves(out, replay, experiment, table, scene.object_ids[k], curves, colours)
     if len(replay.looks.object_ix):

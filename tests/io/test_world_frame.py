@@ -13,7 +13,7 @@ import pytest
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import CLASSES
-from copem_replay.experiment.schema import EgoTopic, ReadFields
+from copem_replay.io.config import EgoTopic, ReadFields
 from copem_replay.io.recording import Recording, read
 from tests.helpers.recordings import SHARED, Topic, ns, write_mcap
 from tests.helpers.ros2 import made, odometry, topic, transform

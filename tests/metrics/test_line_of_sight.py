@@ -88,7 +88,7 @@ def test_only_units_that_are_there_in_a_run_have_it_in_sight() -> None:
     equipped = np.array([[True, True, True, True], [True, False, False, True], [False, True, True, True]])
 
     def of(name: str, there: np.ndarray | None) -> list[list[float]]:
-        found = in_sight_s(first_s, chosen, chosen.configurations[name], there)
+        found = in_sight_s(first_s, chosen, chosen.units_of(chosen.configurations[name]), there)
         return [[float(v) for v in row] for row in found]
 
     nan = pytest.approx(np.nan, nan_ok=True)

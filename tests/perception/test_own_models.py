@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.time_chunk import WHOLE
 from copem_replay.core.view_geometry import Errors, Look, Noise
 from copem_replay.fusion.base import Inbox, StepFusion
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel
-from copem_replay.pipeline.chunking import WHOLE
 from copem_replay.pipeline.log_replay import believed, prepare
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from copem_replay.cli import main as cli
 from copem_replay.core.object_list import Lists, Reports
+from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
@@ -24,7 +25,7 @@ from copem_replay.fusion.union import Union
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import chunking as stretches
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
-from copem_replay.pipeline.chunking import WHOLE, Reach, Stretch
+from copem_replay.pipeline.chunking import Reach
 from copem_replay.pipeline.log_replay import Beliefs, prepare
 from copem_replay.pipeline.receiver import listen, seen_by_all
 from copem_replay.pipeline.run import Result, run

@@ -24,9 +24,10 @@ from mcap.reader import make_reader
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.experiment.schema import Carriers, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import against_log, problems
 from copem_replay.io.recording import Recording
+from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.accuracy_tables import with_accuracy
 from copem_replay.pipeline.closed_form import distributions, exact_table
 from copem_replay.pipeline.expansion import Fleet, fleet_of, of_run

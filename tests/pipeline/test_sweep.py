@@ -19,10 +19,11 @@ import pytest
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError
 from copem_replay.experiment.file import load, log_paths
-from copem_replay.experiment.schema import Carriers, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.closed_form import exact_table
 from copem_replay.pipeline.log_replay import Replay, prepare
 from copem_replay.pipeline.run import run

@@ -15,11 +15,11 @@ import pytest
 from mcap.reader import make_reader
 from pyarrow import parquet
 
+from copem_replay.core.time_chunk import WHOLE
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
 from copem_replay.pipeline import log_replay as replays
-from copem_replay.pipeline.chunking import WHOLE
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
 from copem_replay.results.write import write_results

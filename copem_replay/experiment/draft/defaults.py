@@ -62,7 +62,7 @@ def _ego(log: Log, recording: Recording, fields: Fields | None) -> tuple[str | d
     host = recording.host_id
     none = "the log names no host vehicle" if host is None else f"the log's host vehicle {host} is no moving object"
     for place in _poses(log):
-        from copem_replay.experiment.schema import EgoTopic
+        from copem_replay.io.config import EgoTopic
 
         try:
             asked = EgoTopic.model_validate(place)

@@ -13,9 +13,9 @@ import numpy as np
 
 from copem_replay.core.box_distance import nearest
 from copem_replay.core.tracks import Float, Int, Scene, Tracks
-from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.blocked import blocked
 from copem_replay.metrics.braking.ego_path import Course, EgoCourse
+from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.episodes import Looks
 
 NODE_S = 0.01
@@ -40,7 +40,7 @@ class Encounter:
     spent_s: float  # when the ego that does not brake first comes within the margin
 
 
-def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: Experiment) -> tuple[Encounter, ...]:
+def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: MetricsSetup) -> tuple[Encounter, ...]:
     """The encounters in conflict, in the order of the looks. None without `braking`."""
     braking = experiment.braking
     if braking is None or scene.ego_ix < 0:

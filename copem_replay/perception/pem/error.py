@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import fields
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import AfterValidator
 
-from copem_replay.core.components import Component, NotNegative, Number, asked, wrong
+from copem_replay.core.components import Component, Covariance, NotNegative, Pair, asked, wrong
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import Errors, Look, Noise
 
@@ -56,22 +55,6 @@ def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str
         if not np.isfinite(values).all():
             raise wrong(model, where, f"perturb: {field.name}: expected numbers, found NaN or infinity", "perturb")
     return found
-
-
-Pair = tuple[Number, Number]
-
-
-def _covariance(value: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
-    (a, b), (c, d) = value
-    scale = max(abs(a), abs(d), 1e-12)
-    if abs(b - c) > 1e-9 * scale:
-        raise ValueError(f"expected a symmetric matrix, found {b} and {c} off the diagonal")
-    if a < 0 or d < 0 or a * d - b * c < -1e-9 * scale**2:
-        raise ValueError(f"expected a positive semi-definite matrix, found [[{a}, {b}], [{c}, {d}]]")
-    return value
-
-
-Covariance = Annotated[tuple[Pair, Pair], AfterValidator(_covariance)]
 
 
 class Gaussian(ErrorModel):

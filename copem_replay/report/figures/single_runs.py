@@ -13,6 +13,7 @@ import numpy as np
 
 from copem_replay.core.tracks import Float
 from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.visibility_curves import BY_EGO, share_curves
 from copem_replay.report.figures.captions import list_rates, short_names
 from copem_replay.report.figures.label_layout import STEP_IN, draw_labels, last_instant, mark
 from copem_replay.report.figures.selection import Choice, choose
@@ -21,7 +22,6 @@ from copem_replay.report.figures.timeline import Story, row_of, story
 from copem_replay.report.figures.trajectories import braked_course, free_course
 from copem_replay.results.folder import Results
 from copem_replay.results.reread import reread
-from copem_replay.viewer.curves import BY_EGO, share_curves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from copem_replay.core.errors import InputError
-from copem_replay.experiment.cross_references import unknown
+from copem_replay.core.text import unknown
 from copem_replay.report.figures.style import Appearance, appearances
 from copem_replay.results.compare import Comparison, compare
 from copem_replay.results.compare.labels import DEFAULT_BASELINE

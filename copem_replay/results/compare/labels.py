@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from copem_replay.core.errors import InputError
-from copem_replay.experiment.cross_references import unknown
+from copem_replay.core.text import unknown
 from copem_replay.results.folders import Folder
 
 DEFAULT_BASELINE = "ideal"

@@ -1,0 +1,118 @@
+"""Where perception units stand and when they list: keys of the experiment file, and what perception reads of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Protocol, Self
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from copem_replay.core.components import Frozen, Id, NotNegative, Number, Positive, Share
+from copem_replay.perception.pem.condition import ClassNames, Pem
+
+Point = tuple[Number, Number]
+
+
+def _two(value: object) -> object:
+    if isinstance(value, list | tuple) and len(value) == 3:
+        found = ", ".join(str(number) for number in value)
+        raise ValueError(f"expected two numbers, in the plane, found [{found}]; the height above ground is `height_m`")
+    return value
+
+
+InPlane = Annotated[Point, BeforeValidator(_two)]
+"""A point beside which a height may stand."""
+
+Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
+"""Lists per second."""
+
+
+class Carriers(Frozen):
+    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability `share`."""
+
+    classes: ClassNames
+    share: Share
+
+
+def _what_carries(value: object) -> str:
+    return "carriers" if isinstance(value, dict | Carriers) else "id"
+
+
+On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], Discriminator(_what_carries)]
+
+
+class Placement(Frozen):
+    """Carried `on` the ego, another object or a share of some classes, or standing `at` a place; lists at some rate.
+
+    `height_m` above the ground; left out, a carried unit is on the roof.
+    """
+
+    on: On | None = None
+    at: InPlane | None = None
+    offset_m: InPlane = (0.0, 0.0)
+    yaw_deg: Number = 0.0
+    height_m: NotNegative | None = None
+    ground_z_m: Number | None = None
+    pem: Id | None = None
+    rate_hz: Rate | None = None
+    phase_s: NotNegative = 0.0
+
+
+_AROUND = "the corners in order around an area, each once"
+
+
+def _crooked(reason: str) -> str:
+    """What is wrong with a polygon, of which shapely says `Self-intersection[5 5]`."""
+    what, _, place = reason.rstrip("]").partition("[")
+    at = f" at [{', '.join(place.split())}]" if place else ""
+    words = {"Self-intersection": f"edges that cross or overlap{at}", "Ring Self-intersection": f"edges that meet{at}"}
+    return words.get(what, "corners without an area between them")
+
+
+class Obstacle(Frozen):
+    """A static obstacle beside those in the log."""
+
+    polygon_m: Annotated[tuple[Point, ...], Field(min_length=3)]
+    height_m: Positive
+    ground_z_m: Number | None = None
+
+    @model_validator(mode="after")
+    def _simple(self) -> Self:
+        import shapely
+
+        polygon = shapely.Polygon(self.polygon_m)
+        if not polygon.is_valid or polygon.area <= 0:
+            raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
+        return self
+
+
+class PerceptionSetup(Protocol):
+    """What perception reads of an experiment."""
+
+    @property
+    def seed(self) -> int:
+        """Of all draws."""
+
+    @property
+    def max_gap_s(self) -> float:
+        """States further apart than this (s) are not interpolated between."""
+
+    @property
+    def visibility(self) -> Literal["surface", "flat"]:
+        """Which visible share: of the surface, or of flat outlines."""
+
+    @property
+    def pems(self) -> Mapping[str, Pem]:
+        """Couples by name."""
+
+    @property
+    def units(self) -> Mapping[str, Placement]:
+        """All units by name."""
+
+    @property
+    def modelled(self) -> Mapping[str, Placement]:
+        """Those with a PEM."""
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Static obstacles beside those of the log."""

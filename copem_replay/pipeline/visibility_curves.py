@@ -1,0 +1,54 @@
+"""Visible share of an object over time, from the ego's units and from all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from copem_replay.core.tracks import Float, Int, Tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.perception.observation import Candidates
+from copem_replay.perception.sensor_poses import carrier
+from copem_replay.pipeline.log_replay import Replay
+
+BY_EGO, BY_ANY = "ego", "any unit"
+"""Whose share a curve is: the best of the ego's units, the best of all."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Visible share of one object at instants (K,); NaN where no unit has a list of it."""
+
+    elapsed_ns: Int
+    share: Float
+
+
+def share_curves(replay: Replay, experiment: Experiment, found: Candidates, object_ix: int) -> dict[str, Curve]:
+    """By whom an object is seen, and how much of it; nobody's curve is left out. `found`: its rows, at least."""
+    scene, tracks = replay.scene, found.tracks
+    stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
+    carriers = np.array([carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
+    own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
+    share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
+    rows = np.flatnonzero(tracks.row_object_ix == object_ix)
+    share[tracks.frame_ix[rows]] = found.look.visible_share[rows]
+    # A unit without a list of the object says nothing about it: the best of the others counts.
+    return {
+        whose: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
+        for whose, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
+        if units.any()
+    }
+
+
+def _newest_lists(tracks: Tracks, max_gap_s: float) -> tuple[Int, Int]:
+    """All capture instants (K,), and the newest list of each unit at each (U, K): −1, none for `max_gap_s`."""
+    stamps = np.unique(tracks.stamp_ns)
+    newest = np.full((len(tracks.units), len(stamps)), -1)
+    for unit in range(len(tracks.units)):
+        mine = np.flatnonzero(tracks.frame_unit_ix == unit)  # in order of capture
+        at = np.searchsorted(tracks.stamp_ns[mine], stamps, side="right") - 1
+        known = at >= 0
+        known[known] = stamps[known] - tracks.stamp_ns[mine[at[known]]] <= max_gap_s * 1e9
+        newest[unit, known] = mine[at[known]]
+    return stamps, newest
