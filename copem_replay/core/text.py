@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 def printable(text: str) -> str:
     """On one line, and without what a terminal would act on: names in a recording may hold anything."""
@@ -21,3 +24,11 @@ def interval_words(kind: str, over: str) -> str:
         "bootstrap+exact": "bootstrap interval over {}, nowhere narrower than exact binomial limits",
     }
     return words.get(kind, f"{kind} interval over {{}}").format(over)
+
+
+def unknown(what: str, name: object, known: Iterable[str]) -> str:
+    """That nothing bears a name, and which there are, or which was meant."""
+    names = list(dict.fromkeys(known))
+    near = difflib.get_close_matches(str(name), names, n=1)
+    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"
+    return f"no {what} is named {str(name)!r}{hint}"

@@ -5,10 +5,10 @@ Checked on the file's plain data, so that a typo elsewhere does not hide it.
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+from copem_replay.core.text import unknown
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.file import Source
 from copem_replay.metrics.config import LONGEST_CHAIN
@@ -191,11 +191,3 @@ def _names(mapping: object) -> list[str]:
 
 def _is_name(value: object) -> bool:
     return isinstance(value, str | int) and not isinstance(value, bool)
-
-
-def unknown(what: str, name: object, known: Iterable[str]) -> str:
-    """That nothing bears a name, and which there are, or which was meant."""
-    names = list(dict.fromkeys(known))
-    near = difflib.get_close_matches(str(name), names, n=1)
-    hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"
-    return f"no {what} is named {str(name)!r}{hint}"
