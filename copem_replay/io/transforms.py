@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from copem_replay.core.rotation import back, combined, turned
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.io.plausibility import MAX_GAP_S
-from copem_replay.io.schemas.poses import Poses
+
+if TYPE_CHECKING:
+    from copem_replay.io.schemas.poses import Poses
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,10 +20,12 @@ from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
-from copem_replay.io.recorded_units import RecordedUnits
 from copem_replay.perception.observation import Candidates
 from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline.conversions import as_lists
+
+if TYPE_CHECKING:
+    from copem_replay.io.recorded_units import RecordedUnits
 
 States = Literal["true", "expected", "sampled"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from copem_replay.metrics.detection.by_match import FirstMatches, Steps, capture
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.episodes import Looks, Reference, measured_objects, reference_at
 from copem_replay.metrics.matching import Matches, match
-from copem_replay.pipeline.receiver import Believed
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.receiver import Believed
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mcap.records import Schema
 
@@ -15,7 +15,9 @@ from copem_replay.io.encodings.raw_values import DefinitionError
 from copem_replay.io.log import Channel
 from copem_replay.io.schemas import foxglove as scene_update
 from copem_replay.io.schemas import ros2 as ros2_lists
-from copem_replay.io.schemas.object_lists import Description
+
+if TYPE_CHECKING:
+    from copem_replay.io.schemas.object_lists import Description
 
 _ENCODINGS = ("cdr", "protobuf", "json")
 LISTS = (*ros2_lists.DESCRIPTIONS, *scene_update.SCHEMAS)

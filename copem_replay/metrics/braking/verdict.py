@@ -10,6 +10,7 @@ docs/measures.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numba as nb
 import numpy as np
@@ -18,7 +19,9 @@ from copem_replay.core.box_distance import nearest
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.blocked import required
 from copem_replay.metrics.braking.driver import UNRESOLVED, Driver, Reaction, deceleration_of, delays_of, survival_of
-from copem_replay.metrics.braking.encounter import Encounter
+
+if TYPE_CHECKING:
+    from copem_replay.metrics.braking.encounter import Encounter
 
 _CELLS = 1_000_000
 """Courses × instants held at a time (chosen: 8 MB a column)."""

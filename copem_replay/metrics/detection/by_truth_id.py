@@ -11,6 +11,7 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numba as nb
 import numpy as np
@@ -18,7 +19,9 @@ import numpy as np
 from copem_replay.communication.arrivals import outrun
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.episodes import Looks
+
+if TYPE_CHECKING:
+    from copem_replay.metrics.episodes import Looks
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from copem_replay.report.figures.style import INK
-from copem_replay.report.figures.timeline import Event
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from copem_replay.report.figures.timeline import Event
 
 LABEL_PT = 7.5
 STEP_IN = 0.145

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +27,9 @@ from copem_replay.report.html.plotly_figures import (
     rgb,
     swatch,
 )
-from copem_replay.report.html.study import Study
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _TITLE, _SHARE = "Time since the clock started (s)", "Known by then"
 _MOST_BANDS = 3

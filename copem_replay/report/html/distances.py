@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,9 @@ from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, verdicts
 from copem_replay.report.figures.style import Appearance
 from copem_replay.report.html.markup import Html, joined, tag
 from copem_replay.report.html.plotly_figures import FAINT, INK, Drawn, axis, box, card, layout, numbers, rgb, swatch
-from copem_replay.report.html.study import Study
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _BINS = 40
 """Of the distance, about (chosen)."""

@@ -17,6 +17,8 @@ truth needs no sight, and recorded units don't tell. With `count_earlier` times 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 
@@ -27,8 +29,10 @@ from copem_replay.pipeline.receiver import by_truth
 from copem_replay.report.figures.captions import percent, short_names
 from copem_replay.report.html.markup import Html, joined, table, tag
 from copem_replay.report.html.plotly_figures import FAINT, Drawn, axis, box, label, layout, numbers, place, rgb
-from copem_replay.report.html.study import Study
 from copem_replay.report.html.tables import named
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 HIDDEN, IN_SIGHT, UNTIL_CAPTURED = "hidden", "in sight", "until captured"
 TRANSPORT, FUSION, SINCE_CAPTURED = "transport", "fusion", "since captured"

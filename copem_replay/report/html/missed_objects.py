@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from copem_replay.core.text import counted
 from copem_replay.metrics.summary_text import cell
 from copem_replay.report.html.markup import Html, joined, listed, table, tag
-from copem_replay.report.html.study import Study
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _OPEN = 40
 """Rows up to which the table is shown at once (chosen)."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from copem_replay.report.html.markup import Html, breakable, joined, listed, table, tag
-from copem_replay.report.html.study import Study
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 
 def provenance(study: Study) -> Html:

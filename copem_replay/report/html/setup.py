@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from copem_replay.core.text import counted
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.io.window import in_words
 from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, StartsMoving
 from copem_replay.report.html.markup import Html, table, tag
-from copem_replay.report.html.study import Study
 from copem_replay.report.html.tables import named
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _CLASSES = {"vru": "vulnerable road user", "vehicles": "vehicle"}
 _NAMED = 6

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 
 from copem_replay.report.figures.sweeps import AXES, swept_name
 from copem_replay.report.html.markup import Html, joined, tag
 from copem_replay.report.html.plotly_figures import Drawn, axis, label, layout, line_of, numbers, outlined, place, rgb
-from copem_replay.report.html.study import Study
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _SYMBOLS = {
     "o": "circle",

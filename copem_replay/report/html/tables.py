@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from copem_replay.metrics.summary_text import cell, intervals_said
 from copem_replay.report.html.markup import Html, breakable, joined, listed, table, tag
 from copem_replay.report.html.plotly_figures import swatch
-from copem_replay.report.html.study import Study
 from copem_replay.results.compare.metrics import METRICS
 from copem_replay.results.compare.tables import comparison_lines, plain, signed, without_interval
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _COUNTS = ("n", "n_conflict")
 _INTERVALS = {"detected_share": "interval", "pass_share": "pass_interval"}

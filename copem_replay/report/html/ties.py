@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pandas as pd
 
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.metrics.summary import FEWEST_CLUSTERS
-from copem_replay.report.html.study import Study
+
+if TYPE_CHECKING:
+    from copem_replay.report.html.study import Study
 
 _SAME_S = SAME_INSTANT_NS * 1e-9
 

@@ -6,15 +6,17 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.intervals import Counts
 from copem_replay.metrics.survival import CENSORED, DETECTED, cumulative_incidence, quantile_with_never, restricted_mean
-from copem_replay.results.compare.bootstrap import Clusters, Whose
 from copem_replay.results.compare.paired_statistics import resampled_medians, resampled_sums
+
+if TYPE_CHECKING:
+    from copem_replay.results.compare.bootstrap import Clusters, Whose
 
 
 @dataclass(frozen=True, kw_only=True)

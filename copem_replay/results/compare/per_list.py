@@ -6,12 +6,15 @@ Only instants that both have count (within 1 µs is one): of other latencies or 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int
-from copem_replay.results.compare.configuration_data import Accuracy
 from copem_replay.results.compare.pairing import Grid
+
+if TYPE_CHECKING:
+    from copem_replay.results.compare.configuration_data import Accuracy
 
 _VALUES = 4_000_000
 """Values paired at a time (chosen: a few hundred MB)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
@@ -14,9 +14,11 @@ from copem_replay.core.files import atomic_file
 from copem_replay.core.text import printable
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.summary_text import as_text
-from copem_replay.results.compare.compare import Comparison
 from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.metrics import METRICS
+
+if TYPE_CHECKING:
+    from copem_replay.results.compare.compare import Comparison
 
 _SUFFIXES = (".csv", ".md")
 _RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
