@@ -56,9 +56,11 @@ def resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resam
     if len(names) < DRAWN_FROM:
         return every_resample(len(names))
     zeros = np.zeros(len(names), dtype=np.int64)
-    address = Address(("",), zeros, object_words(names), zeros)
-    uniform = Dice(seed, "summary").uniform("bootstrap", address, np.arange(number))
-    return Resamples(multiplicities(uniform), np.ones(number, dtype=np.int64))
+    address, dice = Address(("",), zeros, object_words(names), zeros), Dice(seed, "summary")
+    size = max(1, _CELLS // len(names))
+    blocks = [np.arange(r, min(r + size, number)) for r in range(0, number, size)]
+    count = np.concatenate([multiplicities(dice.uniform("bootstrap", address, block)) for block in blocks])
+    return Resamples(count, np.ones(number, dtype=np.int64))
 
 
 @cache
@@ -83,13 +85,8 @@ def multiplicities(uniform: Float) -> Counts:
     if uniform.ndim != 2 or uniform.shape[1] == 0 or not ((uniform > 0) & (uniform < 1)).all():
         raise ValueError("multiplicities: expected (R, K) numbers between 0 and 1, ends excluded, and a cluster")
     R, K = uniform.shape
-    count = np.empty((R, K), dtype=np.uint32)
-    size = max(1, _CELLS // K)
-    for r in range(0, R, size):
-        block = uniform[r : r + size]
-        drawn = (block * K).astype(np.int64) + K * np.arange(len(block))[:, None]
-        count[r : r + size] = np.bincount(drawn.ravel(), minlength=block.size).reshape(block.shape)
-    return count
+    drawn = (uniform * K).astype(np.int64) + K * np.arange(R)[:, None]
+    return np.bincount(drawn.ravel(), minlength=uniform.size).reshape(R, K).astype(np.uint32)
 
 
 def percentile_limits(values: Float, resampled: Resamples, *, confidence: float = 0.95) -> tuple[float, float]:

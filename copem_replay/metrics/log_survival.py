@@ -41,26 +41,22 @@ def first_of(arrives_s: Float, listed: Float, unit_ix: Int, share: Float) -> Fir
     A unit that is there with probability q < 1, `share (U,)`, misses the object with (1 − q) + q Π (1 − p).
     """
     time_s, instant = _by_instant(arrives_s)
-    sure = share[unit_ix] == 1
-    perhaps = [(unit_ix == unit, float(share[unit])) for unit in np.unique(unit_ix[~sure])]
-
-    def steps(odds: float) -> Float:
-        missed = _log_missed(listed, odds)
-        total = _at(instant[sure], missed[sure], len(time_s))
-        for mine, there in perhaps:
-            total += _perhaps(_at(instant[mine], missed[mine], len(time_s)), there)
-        return total
-
-    step = steps(1.0)
+    missed, half = _log_missed(listed, 1.0), _log_missed(listed, _HALF)
+    step, slope, log_half = np.zeros(len(time_s)), 0.0, 0.0
+    # Who is certain to be there is one group.
+    group = np.where(share[unit_ix] == 1, -1, unit_ix)
+    order = np.argsort(group, kind="stable")
+    numbers, begins = np.unique(group[order], return_index=True)
+    for number, mine in zip(numbers, np.split(order, begins[1:]), strict=False):
+        there = 1.0 if number < 0 else float(share[number])
+        alone = _at(instant[mine], missed[mine], len(time_s))
+        step += _perhaps(alone, there)
+        log_half += float(_perhaps(half[mine].sum(keepdims=True), there)[0])
+        # Its lists can tell more only if it is there, which it hardly is when all of them have missed.
+        slope -= float(_there(alone.sum(keepdims=True), there)[0][0]) * float(listed[mine].sum())
     unknown = np.cumsum(step)
     probability = np.exp(_before(unknown)) * (0.0 - np.expm1(step))
-    log_never = float(unknown[-1]) if len(unknown) else 0.0
-    # Only who is there can detect more: each unit's lists count by how probably it is there though it has missed all.
-    slope = -listed[sure].sum()
-    for mine, there in perhaps:
-        still, _ = _there(_log_missed(listed[mine], 1.0).sum(keepdims=True), there)
-        slope -= still[0] * listed[mine].sum()
-    return _known(time_s, probability, log_never, float(slope), float(steps(_HALF).sum()))
+    return _known(time_s, probability, float(unknown[-1]) if len(unknown) else 0.0, slope, log_half)
 
 
 def confirmed(instant: Int, arrives_s: Float, listed: Float, hits: int, of: int) -> FirstKnown:
@@ -122,15 +118,19 @@ def _there(log_missed: Float, share: float) -> tuple[Float, Float]:
     """
     from scipy.special import expit, logit
 
+    if share == 1:
+        return np.ones(len(log_missed)), np.zeros(len(log_missed))
     log_odds = logit(share) + log_missed
     return expit(log_odds), expit(-log_odds)
 
 
 def _perhaps(step: Float, share: float) -> Float:
-    """(K,) the steps of a unit that is there with probability `share` < 1, from those (K,) of one that is.
+    """(K,) the steps of a unit that is there with probability `share`, from those (K,) of one that is.
 
     Neither a step near 0 nor one near −∞ is the difference of two numbers.
     """
+    if share == 1:
+        return step
     there, absent = _there(_before(np.cumsum(step)), share)
     found = there * -np.expm1(step)
     return np.where(found < 0.5, np.log1p(-np.minimum(found, 0.5)), np.log(absent + there * np.exp(step)))

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
-from copem_replay.core.time_chunk import Stretch
 from copem_replay.core.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
 from copem_replay.core.view_geometry import Look
 from copem_replay.perception.config import PerceptionSetup
@@ -52,6 +52,11 @@ class Candidates:
             self.existence[rows],
         )
 
+    @cached_property
+    def listable(self) -> Candidates:
+        """Only the rows that are listed with any probability: the others are in no list of any run."""
+        return self if (self.probability > 0).all() else self.take_rows(np.flatnonzero(self.probability > 0))
+
     @property
     def ever_met(self) -> Bool:
         """(U,) whether a condition of each unit's PEM is met by any object here."""
@@ -60,23 +65,39 @@ class Candidates:
 
 
 class KeptShares:
-    """Visible shares of stretches of a log, by far what takes longest of their candidates and least to keep.
+    """Visible shares of stretches of a log: what takes longest of their candidates, and least to keep.
 
-    Kept as long as there is room: a number of each row, where the rows themselves would be forty.
+    Kept as long as there is room: one number of each row, where the rows themselves would be forty.
     """
 
     def __init__(self, room_bytes: int = 256_000_000) -> None:
         self._room_bytes = room_bytes
-        self._kept: dict[tuple[object, ...], Float] = {}
+        self._kept: dict[tuple[str, float, float], Float] = {}
 
-    def of(self, key: tuple[object, ...], made: Callable[[], Float]) -> Float:
-        """What was made for this key before, else what is made now."""
-        found = self._kept.get(key)
+    def of(
+        self, units: str, world: Tracks, times_s: tuple[float, float, float], seen: Callable[[Tracks], Float]
+    ) -> Float:
+        """Shares (U, P) of a world captured from the first time on and before the last, cut at the one between.
+
+        `units`: their name. Each part is computed once.
+        """
+        from_s, cut_s, until_s = times_s
+        shares = self._part(units, world, cut_s, until_s, seen)
+        if from_s >= cut_s:
+            return shares
+        late = world.row_captured_s >= cut_s
+        whole = np.empty((len(shares), len(late)))
+        whole[:, late] = shares
+        whole[:, ~late] = self._part(units, world, from_s, cut_s, seen)
+        return whole
+
+    def _part(self, units: str, world: Tracks, from_s: float, until_s: float, seen: Callable[[Tracks], Float]) -> Float:
+        found = self._kept.get((units, from_s, until_s))
         if found is None:
-            found = made()
+            found = seen(world.captured_between(from_s, until_s))
             if found.nbytes <= self._room_bytes:
                 self._room_bytes -= found.nbytes
-                self._kept[key] = found
+                self._kept[units, from_s, until_s] = found
         return found
 
 
@@ -103,22 +124,24 @@ def candidates(
     from_s: float = -np.inf,
     until_s: float = np.inf,
     kept: KeptShares | None = None,
+    cut_s: float | None = None,
 ) -> Candidates:
     """All candidate rows of an experiment's units over one log (`truth`: the world at its own frames).
 
     Of a stretch only the rows captured from an instant on and before another; lists are always all there. `placed`:
-    where the units are, None: to be found out. `kept`: of the same log and units.
+    where the units are, None: to be found out. `kept`: of the same log and units; `cut_s`: from where on other calls
+    will ask for the same rows, None: `from_s`.
     """
     if placed is None:
         placed = place(scene, truth, experiment)
     pieces: dict[str, tuple[Tracks, Look]] = {}
-    for names, world in _worlds(scene, truth, experiment, placed, from_s, until_s):
+    for names, world in worlds(scene, truth, experiment, placed, from_s, until_s):
         places = [placed.poses[name] for name in names]
         carriers = np.array([placed.carrier_ix[name] for name in names])
         flat = experiment.visibility == "flat"
         watching = observers(places, carriers)
-        seen = partial(visible_shares, world, placed.static, watching, flat=flat)
-        shares = seen() if kept is None else kept.of((names[0], from_s, until_s), seen)
+        seen = partial(visible_shares, static=placed.static, observers=watching, flat=flat)
+        shares = seen(world) if kept is None else kept.of(names[0], world, (from_s, cut_s or from_s, until_s), seen)
         for k, name in enumerate(names):
             pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
     ordered = [pieces[name] for name in experiment.modelled]
@@ -133,34 +156,10 @@ def candidates(
     return Candidates(tracks, look, *_assess(tracks, look, experiment))
 
 
-def could_meet(
-    scene: Scene, truth: Tracks, experiment: PerceptionSetup, placed: Placed, cut: Sequence[Stretch]
-) -> Bool:
-    """(U,) whether an object ever has range, azimuth and class of a condition of each unit's PEM, seen or hidden.
-
-    Without a look at who hides whom: what is never met here, no replay meets. `cut`: the stretches of the log.
-    """
-    met = dict.fromkeys(experiment.modelled, False)
-    for stretch in cut:
-        for names, world in _worlds(scene, truth, experiment, placed, stretch.from_s, stretch.until_s):
-            for name in names:
-                if met[name]:
-                    continue
-                whole = np.ones(len(world.frame_ix))
-                tracks, look = _from_unit(world, placed.poses[name], placed.carrier_ix[name], whole)
-                look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
-                pem = experiment.pems[str(experiment.units[name].pem)]
-                anyhow = (couple.when.model_copy(update={"visible_share": None}) for couple in pem)
-                met[name] = any(bool(condition.holds(look).any()) for condition in anyhow)
-        if all(met.values()):
-            break
-    return np.array(list(met.values()), dtype=bool)
-
-
-def _worlds(
+def worlds(
     scene: Scene, truth: Tracks, experiment: PerceptionSetup, placed: Placed, from_s: float, until_s: float
 ) -> Iterator[tuple[list[str], Tracks]]:
-    """The world at the lists of the units, once for all units that have theirs at the same instants."""
+    """The world at the lists of the modelled units, once for all that have theirs at the same instants (by name)."""
     together: dict[bytes, list[str]] = {}
     for name, stamps in placed.stamps_ns.items():
         together.setdefault(stamps.tobytes(), []).append(name)
@@ -221,8 +220,7 @@ def _assess(tracks: Tracks, look: Look, experiment: PerceptionSetup) -> tuple[In
     """Which couple of its unit's PEM applies to each row, the probability it gives, and the existence it claims."""
     couple_ix = np.full(len(tracks.frame_ix), -1)
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
-    for k, unit in enumerate(experiment.modelled.values()):
-        rows = np.flatnonzero(tracks.row_unit_ix == k)
+    for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         seen = look.take(rows)
         pem = experiment.pems[str(unit.pem)]
         couple_ix[rows] = applies(pem, seen)
@@ -234,3 +232,10 @@ def _assess(tracks: Tracks, look: Look, experiment: PerceptionSetup) -> tuple[In
                 claimed = couple.existence
                 existence[mine] = look.visible_share[mine] if claimed == "visible_share" else claimed
     return couple_ix, probability, existence
+
+
+def rows_by_unit(tracks: Tracks) -> list[Int]:
+    """The rows of each unit, ascending."""
+    order = np.argsort(tracks.row_unit_ix, kind="stable")
+    bounds = np.searchsorted(tracks.row_unit_ix[order], np.arange(len(tracks.units) + 1))
+    return [order[first:after] for first, after in pairwise(bounds.tolist())]

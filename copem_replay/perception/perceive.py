@@ -15,7 +15,7 @@ from copem_replay.core.interpolation import wrap
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.config import PerceptionSetup
-from copem_replay.perception.observation import Candidates
+from copem_replay.perception.observation import Candidates, rows_by_unit
 from copem_replay.perception.pem.error import errors_of
 
 SMALLEST_SIZE_M = 0.05
@@ -83,9 +83,9 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: PerceptionSetup, d
         name: np.zeros((1, P))
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
-    for k, unit in enumerate(experiment.modelled.values()):
+    for unit, mine in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
         for c, couple in enumerate(experiment.pems[str(unit.pem)]):
-            rows = np.flatnonzero((seen.row_unit_ix == k) & (found.couple_ix == c))
+            rows = mine[found.couple_ix[mine] == c]
             if couple.error is None or not len(rows):
                 continue
             where = f"pems.{unit.pem}[{c}].error"

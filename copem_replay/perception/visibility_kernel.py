@@ -19,6 +19,8 @@ Work = tuple[Float, Float, Float, Float, Float, Float, Float]
 
 _OVERLAP_M = 1e-6
 """Footprints that enter each other by less than this only touch (chosen)."""
+_SURELY = 1e-6
+"""By how much, in rad, m and of slopes, a body that hides all of another exceeds it (chosen: far above rounding)."""
 _MAX_PIECES = 512
 """Azimuth pieces per view (chosen): 60 bodies in front of one target need about 250."""
 
@@ -121,6 +123,8 @@ def views(
                 count = _drop_overlapping(t, near, count, xy, size, middle, radius, owner)
                 if count == 0:
                     out[u, first + t] = 1.0
+                elif _hidden_by_one(t, near, count, distance, radius, bearing, lo, hi, zlo, zhi, oz, flat):
+                    out[u, first + t] = 0.0
                 else:
                     out[u, first + t] = _share(
                         t, near, count, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work
@@ -134,6 +138,35 @@ def views(
                     if left < least:
                         least = left
                         blocker[u, first + t] = first + near[i] if near[i] < n else -2 - owner[near[i]]
+
+
+@nb.njit(cache=True, nogil=True)
+def _hidden_by_one(
+    t: int, near: Int, count: int, distance: Float, radius: Float, bearing: Float, lo: Float, hi: Float,
+    zlo: Float, zhi: Float, oz: float, flat: bool,
+) -> bool:  # fmt: skip
+    # Whether one body surely hides all of target t, by bounds alone: what `_share` would find, in far less time.
+    nearest, farthest = distance[t] - radius[t], distance[t] + radius[t]
+    z0, z1 = zlo[t] - oz, zhi[t] - oz
+    lowest = z0 / nearest if z0 < 0.0 else z0 / farthest  # slopes between which the target is
+    highest = z1 / nearest if z1 > 0.0 else z1 / farthest
+    for i in range(count):
+        b = near[i]
+        begins, ends = distance[b] - radius[b], distance[b] + radius[b]
+        if begins <= _SURELY or ends + _SURELY >= nearest:
+            continue
+        turn = bearing[b] - bearing[t]
+        turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
+        if turn + lo[b] + _SURELY >= lo[t] or turn + hi[b] - _SURELY <= hi[t]:
+            continue
+        if flat:
+            return True
+        bottom, top = zlo[b] - oz, zhi[b] - oz
+        from_slope = bottom / ends if bottom < 0.0 else bottom / begins
+        to_slope = top / ends if top > 0.0 else top / begins
+        if from_slope + _SURELY < lowest and to_slope - _SURELY > highest:
+            return True
+    return False
 
 
 @nb.njit(inline="always")

@@ -131,17 +131,19 @@ class Replay:
             from_s=stretch.from_s if from_s is None else from_s,
             until_s=stretch.until_s,
             kept=self._shares,
+            cut_s=stretch.from_s,
         )
 
     def world(self, experiment: Experiment) -> World:
         """The log as the units of an experiment have it, by configuration."""
-        return World(self.scene, self.truth, self._whole, self.recorded, fleet_of(experiment, self.scene).experiment)
+        units = fleet_of(experiment, self.scene).experiment
+        return World(self.scene, self.truth, self._whole.listable, self.recorded, units)
 
     def worlds(self, experiment: Experiment, there: Bool | None, *, measured_only: bool = False) -> Iterator[World]:
         """The same stretch by stretch, all of it or what is looked at, for receivers of the units `there (U,)`."""
         if self.stretches == (WHOLE,):
             whole = self.world(experiment)
-            yield replace(whole, found=self.measured) if measured_only else whole
+            yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment)
         units, seen = lists.experiment, seen_by_all(lists, np.arange(1), states="true")
@@ -150,7 +152,7 @@ class Replay:
         )
         for stretch in self.stretches:
             earliest_s = reach.earliest_s(stretch)
-            found = self.found(stretch, earliest_s)
+            found = self.found(stretch, earliest_s).listable
             yield World(
                 self.scene,
                 self.truth.captured_between(earliest_s, stretch.until_s),
@@ -367,6 +369,7 @@ def _sightings(replay: Replay, experiment: Experiment, runs: Int, equipped: Bool
     pieces = []
     for stretch in replay.stretches:
         found = replay.measured if stretch == WHOLE else replay.found(stretch).of_objects(replay.looks.object_ix)
+        found = found.listable
         recorded = None
         if replay.recorded is not None:
             recorded = replay.recorded.captured_between(stretch.from_s, stretch.until_s)

@@ -2,21 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
+from copem_replay.core.interpolation import wrap
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, TRUTH, Bool
+from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks
+from copem_replay.core.view_geometry import Look
 from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import At
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
-from copem_replay.perception.observation import could_meet
+from copem_replay.perception.observation import worlds
+from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.sensor_poses import Poses
 from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.sweep import without_points
 
 FAR_M = 2000.0
 """A place farther away from all objects is taken for a mistake (chosen: no sensor beside a road sees so far)."""
+
+_ROWS = 500_000  # object states looked at in one piece (chosen: some ten MB)
+_SAMPLE = 16  # one in so many is looked at first (chosen)
+
+
+def notes_of(
+    recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
+) -> list[str]:
+    """What has to be said of the recordings, and of them and the experiment together: after a replay, or before."""
+    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
+    for replay in ready:
+        met = replay.ever_met if replayed else None
+        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
+    notes += without_points(experiment)
+    if experiment.measure.accuracy and not same_units(ready):
+        notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+    return notes
+
+
+def same_units(ready: Sequence[Replay]) -> bool:
+    """Whether all runs have the same units."""
+    return all(bool((replay.fleet.share == 1).all()) for replay in ready)
 
 
 def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
@@ -26,8 +55,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     by range, azimuth and class.
     """
     if met is None:
-        log, fleet = replay.scene, replay.fleet
-        met = could_meet(log, replay.truth, fleet.experiment, replay.placed, replay.stretches)
+        met = could_meet(replay)
     yield from replay.placed.notes
     yield from _far_away(replay, experiment)
     yield from _idle(replay, experiment, met)
@@ -41,6 +69,51 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
         late = [unit for unit in units if configuration.latency_of(unit) > end_s]
         if late:
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
+
+
+def could_meet(replay: Replay) -> Bool:
+    """(U,) whether an object ever has range, azimuth and class of a condition of each modelled unit's PEM.
+
+    Without a look at what hides what: where nothing is met here, no replay meets anything. Piece by piece of the log.
+    """
+    experiment, scene = replay.fleet.experiment, replay.scene
+    met = dict.fromkeys(experiment.modelled, False)
+    _, bounds = replay.truth.by_frame
+    pieces = -(-len(replay.truth.frame_ix) // _ROWS)
+    inner = np.searchsorted(bounds, np.arange(1, pieces) * _ROWS)
+    cuts = [-np.inf, *replay.truth.captured_s[np.unique(inner[inner < len(bounds) - 1])].tolist(), np.inf]
+    for from_s, until_s in pairwise(cuts):
+        if all(met.values()):
+            break
+        for names, world in worlds(scene, replay.truth, experiment, replay.placed, from_s, until_s):
+            for name in names:
+                if not met[name]:
+                    pem = experiment.pems[str(experiment.units[name].pem)]
+                    met[name] = _meets(pem, scene, world, replay.placed.poses[name], replay.placed.carrier_ix[name])
+    return np.array(list(met.values()), dtype=bool)
+
+
+def _meets(pem: Pem, scene: Scene, world: Tracks, at: Poses, carrier_ix: int) -> bool:
+    """Whether any object of a world is where a condition holds, at a list that the unit makes."""
+    there = np.flatnonzero(at.present)
+    order, bounds = world.by_frame
+    if not len(there):
+        return False
+    rows = order[bounds[there[0]] : bounds[there[-1] + 1]]
+    anyhow = [couple.when.model_copy(update={"visible_share": None}) for couple in pem]
+    for some in (rows[::_SAMPLE], rows):  # of what is met at all, much is
+        frame = world.frame_ix[some]
+        kept = at.present[frame] & (world.row_object_ix[some] != carrier_ix)
+        some, frame = some[kept], frame[kept]
+        dx_m, dy_m = world.x_m[0, some] - at.x_m[frame], world.y_m[0, some] - at.y_m[frame]
+        bearing_rad, none = np.arctan2(dy_m, dx_m), np.zeros(len(some))
+        look = Look(
+            np.hypot(dx_m, dy_m), wrap(bearing_rad - at.heading_rad[frame]), bearing_rad, none,
+            scene.object_class[world.row_object_ix[some]], none, none, none, none, none,
+        )  # fmt: skip
+        if any(bool(condition.holds(look).any()) for condition in anyhow):
+            return True
+    return False
 
 
 def _far_away(replay: Replay, experiment: Experiment) -> Iterator[str]:

@@ -22,8 +22,8 @@ from copem_replay.pipeline.closed_form import check_exact, exact_table
 from copem_replay.pipeline.cost import Cost, watched
 from copem_replay.pipeline.log_replay import Outcome, Replay
 from copem_replay.pipeline.memory import memory_notes
-from copem_replay.pipeline.oddities import oddities
-from copem_replay.pipeline.sweep import Point, points, without_points
+from copem_replay.pipeline.oddities import notes_of, same_units
+from copem_replay.pipeline.sweep import Point, points
 
 Progress = Callable[[int, int], None]
 """`progress(done, total)`, called after each block of runs."""
@@ -86,7 +86,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):
-        accuracy = accuracy_tables(parts, order, same_units=_same_units(ready))
+        accuracy = accuracy_tables(parts, order, same_units=same_units(ready))
     return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
 
 
@@ -96,25 +96,6 @@ def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
     for point in points(experiment):
         if point.same_units:
             check_exact(ready, point.experiment)
-
-
-def notes_of(
-    recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
-) -> list[str]:
-    """What has to be said of the recordings, and of them and the experiment together: after a replay, or before."""
-    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
-    for replay in ready:
-        met = replay.ever_met if replayed else None
-        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
-    notes += without_points(experiment)
-    if experiment.measure.accuracy and not _same_units(ready):
-        notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
-    return notes
-
-
-def _same_units(ready: Sequence[Replay]) -> bool:
-    """Whether all runs have the same units."""
-    return all(bool((replay.fleet.share == 1).all()) for replay in ready)
 
 
 def _at_point(

@@ -20,6 +20,7 @@ from copem_replay.results.lock import only_writer
 
 EXPERIMENT = "experiment.yaml"
 _NEW, _SPARE = "results", "copy"
+_OTHERS = "something else came there during the run, and stays"
 _ROOM = 600
 """Bytes that paths in a results folder, and in the scratch folders in it, may take (chosen: two names and a half)."""
 
@@ -53,33 +54,38 @@ class Place:
         """Give the new folder its name: what is there goes when all of the new one is on the disk. Raises OSError."""
         flush_all(self.new)
         there = _folder_at(self.folder)
+        why: str | None = _OTHERS
         if there is None:
-            placed = _given(self.new, self.folder)
+            why = None if _given(self.new, self.folder) else _OTHERS
         elif self.before is not None and os.path.samestat(there, self.before):
-            placed = self._replace(files)
-        else:
-            placed = False
-        if not placed:
-            self._elsewhere()
+            why = self._replace(files)
+        if why is not None:
+            self._elsewhere(why)
         flush(self.folder.parent)
 
-    def _replace(self, files: Sequence[str]) -> bool:
-        """Put the new folder in the place of the old one, with what in it is not ours. False: it is another by now."""
+    def _replace(self, files: Sequence[str]) -> str | None:
+        """Put the new folder in the place of the old one, with what in it is not ours. Returns why not: None, it is."""
         held = belongings(self.folder)
         if held is None:
-            return False
-        kept = self._keep(held, files)
+            return _OTHERS
+        try:
+            kept = self._keep(held, files)
+        except OSError as error:
+            for name in set(held.others(files)) - set(files):
+                with suppress(OSError):
+                    (self.new / name).unlink()
+            return f"not replaced, as {error.filename} can be neither linked nor copied ({error.strerror})"
         assert self.before is not None
         if exchange(self.new, self.folder):
             if not os.path.samestat(self.new.stat(), self.before):
                 exchange(self.new, self.folder)
-                return False
+                return _OTHERS
             old = self.new
         else:
             old = self.scratch.path / OLD
             _move_in(self.new, self.folder, old)
         self._keep_late(old, held, kept)
-        return True
+        return None
 
     def _keep(self, held: Belongings, files: Sequence[str]) -> dict[str, str]:
         """Have what is not ours in the new folder, too: its names there by those in the old one."""
@@ -108,17 +114,15 @@ class Place:
                     kept[name] = keep(name, old, self.folder, self.scratch.path / _SPARE)
                     self.scratch.add_same(f"{old.name}/{name}", f"{self.folder.name}/{kept[name]}")
 
-    def _elsewhere(self) -> None:
-        """Give the new folder another name: there are results by now that this run was not to replace."""
+    def _elsewhere(self, why: str) -> None:
+        """Give the new folder another name."""
         number = 2
         while True:
             other = self.asked_folder.with_name(f"{self.asked_folder.name}-{number}")
             if not os.path.lexists(other) and _given(self.new, other):
                 break
             number += 1
-        self.notes.append(
-            f"{self.asked}: something else came there during the run, and stays; its results are in {other}"
-        )
+        self.notes.append(f"{self.asked}: {why}; the results of this run are in {other}")
         self.folder = other
 
 

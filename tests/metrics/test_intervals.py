@@ -8,11 +8,13 @@ from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
+from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.metrics.intervals import (
     Resamples,
     alike_limits,
@@ -26,6 +28,8 @@ from copem_replay.metrics.intervals import (
     resamples,
     share_limits,
 )
+from copem_replay.metrics.summary import summary
+from copem_replay.metrics.summary_text import summary_text
 from tests.helpers.compare_folders import limits_of, widened
 
 Array = npt.NDArray[np.float64]
@@ -63,17 +67,28 @@ def test_seven_clusters_are_worked_out_and_eight_are_drawn():
     assert (resamples([f"log{k}" for k in range(8)], 4).count != eight.count).any()
 
 
+def test_many_clusters_are_drawn_part_by_part_as_well_as_at_once():
+    names = [f"object {k}" for k in range(3000)]  # of which 2000 resamples are more than is held at a time
+    drawn = resamples(names, 5).count
+    assert (drawn.sum(axis=1) == 3000).all()
+    zeros = np.zeros(3000, dtype=np.int64)
+    uniform = Dice(5, "summary").uniform(
+        "bootstrap", Address(("",), zeros, object_words(names), zeros), np.arange(1998, 2000)
+    )
+    assert drawn[1998:].tolist() == [np.bincount((u * 3000).astype(int), minlength=3000).tolist() for u in uniform]
+
+
 @pytest.mark.parametrize("clusters", [0, 8])
 def test_every_resample_of_no_cluster_or_of_many_is_refused(clusters):
     with pytest.raises(ValueError, match="1 to 7 clusters"):
         every_resample(clusters)
 
 
-@given(st.lists(st.integers(-20, 20), min_size=2, max_size=6), st.floats(0.5, 0.99))
+@given(st.lists(st.integers(-20, 20), min_size=2, max_size=5), st.floats(0.5, 0.99))
 def test_limits_are_those_of_all_resamples_written_out(values: list[int], confidence: float):
     """A resample that stands for many counts as often: the quantile of K^K figures, linear between neighbours."""
     every = every_resample(len(values))
-    means = [np.mean(some) for some in itertools.product(values, repeat=len(values))]
+    means = [sum(some) / len(some) for some in itertools.product(values, repeat=len(values))]
     found = percentile_limits(every.count @ np.array(values) / len(values), every, confidence=confidence)
     assert found == pytest.approx(np.quantile(means, widened(len(values), confidence)), abs=1e-9)
 
@@ -300,6 +315,29 @@ def test_limits_of_a_share_are_never_narrower_than_either(clusters: list[tuple[i
     least, most = exact_limits(n * successes.sum() / totals.sum(), n)
     assert low <= least + 1e-12
     assert most - 1e-12 <= high
+
+
+def rows_of(detected: list[list[bool]]) -> pd.DataFrame:
+    """Rows of one configuration, an object each with its runs, that are looked at for 2 s and known at 1 s or never."""
+    found = pd.DataFrame(
+        [
+            {"object_id": str(k), "run": run, "detected": known, "time_to_detection_s": 1.0 if known else math.nan}
+            for k, of_object in enumerate(detected)
+            for run, known in enumerate(of_object)
+        ]
+    )
+    return found.assign(log="a", configuration="c", onset_s=0.0, ended_s=2.0, ended_by="object_left",
+                        distance_at_detection_m=5.0)  # fmt: skip
+
+
+def test_the_summary_of_five_objects_that_are_always_detected() -> None:
+    table, notes = summary(rows_of([[True] * 20] * 5), ["c"], {"c": 10.0}, seed=1, horizon_s=2.0)
+    (row,) = table.to_dict("records")
+    assert (row["detected_share_low"], row["detected_share_high"]) == (pytest.approx(0.025**0.2), 1.0)
+    assert (row["interval"], row["interval_over"], notes) == ("bootstrap+exact", "objects", [])
+    lines = summary_text(table).splitlines()
+    assert "[0.4782, 1]" in lines[1]
+    assert "95 %: bootstrap interval over objects, nowhere narrower than exact binomial limits" in lines
 
 
 # ------------------------------------------------------------------------------------ differences that are all alike

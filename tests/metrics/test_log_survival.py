@@ -170,7 +170,7 @@ def test_lists_that_are_all_alike() -> None:
     assert found.log_never == pytest.approx(22 * math.log(0.1), rel=1e-14)
     assert found.per_logit == pytest.approx(-22 * 0.9, rel=1e-14)
     assert found.log_never_half == pytest.approx(22 * math.log(2 / 11), rel=1e-14)
-    assert found.probability.tolist() == pytest.approx([0.9 * 0.1**k for k in range(22)], rel=1e-12)
+    assert found.probability.tolist() == pytest.approx([0.9 * 0.1**k for k in range(22)], rel=1e-12, abs=0)
 
 
 def test_a_unit_that_is_there_every_other_time() -> None:

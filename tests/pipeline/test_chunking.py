@@ -17,12 +17,14 @@ from hypothesis import strategies as st
 from copem_replay.cli import main as cli
 from copem_replay.core.object_list import Lists, Reports
 from copem_replay.core.time_chunk import WHOLE, Stretch
+from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.union import Union
 from copem_replay.io.recording import Recording
+from copem_replay.perception.visibility import visible_shares
 from copem_replay.pipeline import chunking as stretches
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.chunking import Reach
@@ -233,6 +235,65 @@ def test_stretches_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("copem_replay.pipeline.log_replay.ROWS_HELD", 40)
     with pytest.raises(Exception, match="too long to be held at once; take a window of it"):
         Beliefs(replay, experiment(), 0).whole()
+
+
+def standing_still(frames: int, objects: int) -> Recording:
+    """So many objects at one place, at 10 Hz."""
+    rows, stamps = frames * objects, np.arange(frames) * 10**8
+    log = scenes.recording([Thing(str(k), "car", standing(0, 0)) for k in range(objects)], until_s=0.1)
+    truth = Tracks(
+        units=(TRUTH,), start=np.arange(objects + 1) * frames, unit_ix=np.zeros(objects, dtype=np.int64),
+        object_ix=np.arange(objects), frame_ix=np.tile(np.arange(frames), objects), stamp_ns=stamps,
+        captured_s=stamps * 1e-9, frame_unit_ix=np.zeros(frames, dtype=np.int64), arrives_s=stamps[None] * 1e-9,
+        valid=np.ones((1, rows), dtype=bool), **{name: np.ones((1, rows)) for name in VALUES},
+    )  # fmt: skip
+    return Recording(**{**vars(log), "truth": truth})
+
+
+def test_a_log_of_half_a_million_rows_is_cut() -> None:
+    """3000 frames of 60 objects and two units: 3000 · 60 · 3 candidate rows, 200 s in a city at the most."""
+    two = {"ego": scenes.EGO_UNIT, "mast": {"at": [0, 9], "height_m": 5.0, "pem": "sure"}}
+    log, plan = standing_still(3000, 60), experiment(ego="0", units=two)
+    assert stretches.candidate_rows(log.scene, log.truth, plan) == 540_000
+    cuts = stretches.stretches(log.scene, log.truth, plan)
+    assert [(1000 * k + 999.381966) / 10 for k in range(2)] == pytest.approx([cut.until_s for cut in cuts[:-1]])
+    assert stretches.stretches(log.scene, log.truth, experiment(ego="0")) == (WHOLE,)  # 360 000
+
+
+@pytest.mark.parametrize("rows_at_once", [10**9, 60])
+def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen up to 20 m only: of all others nothing is drawn, fused or kept."""
+    monkeypatch.setattr(stretches, "ROWS_AT_ONCE", rows_at_once)
+    monkeypatch.setattr(stretches, "ROWS_A_STRETCH", rows_at_once)
+    near = [{"when": {"range_m": [0, 20]}, "detection": {"kind": "constant", "probability": 0.5}}]
+    plan = experiment(pems={"sure": near})
+    replay = prepare(traffic(), plan)
+    found = replay.found(WHOLE)
+    listed = np.flatnonzero((found.look.range_m >= 0) & (found.look.range_m < 20))
+    assert 0 < len(listed) < len(found.look.range_m) / 2
+    held = [set(world.found.look.range_m.tolist()) for world in replay.worlds(plan, None)]
+    assert set().union(*held) == set(found.look.range_m[listed].tolist())
+
+
+def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many blocks of runs, passes and files there are; of the same units and rows."""
+    views: list[int] = []
+
+    def counted(world: Tracks, static: Any, observers: Any, *, flat: bool) -> Any:
+        views.append(len(world.frame_ix) * len(observers.carrier_ix))
+        return visible_shares(world, static, observers, flat=flat)
+
+    monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
+    monkeypatch.setattr(stretches, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(stretches, "ROWS_A_STRETCH", 60)
+    monkeypatch.setattr("copem_replay.pipeline.log_replay.BLOCK_BYTES", 1)
+    plan = experiment(runs=3, configurations={"late": {"units": "all", "latency_s": 0.4}}, pems={"sure": NOISY})
+    result = run(plan, [traffic()])
+    [replay] = result.replays
+    list(Beliefs(replay, plan, 0))
+    rows = len(replay.truth.frame_ix)
+    # What a stretch needs from before it is looked at with it once more: 0.4 s and a list of 6 objects at 10 Hz.
+    assert rows <= sum(views) <= rows + (len(replay.stretches) - 1) * 6 * 6
 
 
 def test_how_far_back_a_stretch_reaches() -> None:

@@ -517,7 +517,7 @@ class TestTails:
         result = run(masts(2, 0.9), [one_walker()])
         assert result.exact is not None
         never, row = result.exact.iloc[-1], result.summary.iloc[0]
-        assert never["probability"] == pytest.approx(1e-22, rel=1e-12)
+        assert never["probability"] == pytest.approx(1e-22, rel=1e-12, abs=0)
         for found in (never, row):
             assert found["miss_log10"] == pytest.approx(-22, rel=1e-13)
             assert found["miss_per_logit"] == pytest.approx(-22 * 0.9, rel=1e-13)
@@ -547,6 +547,14 @@ class TestTails:
         assert row["miss_per_logit"] == pytest.approx(-(1e-4 * 3.6 + 1e-2 * 1.8) / (1e-4 + 1e-2), rel=1e-12)
         half = math.log10(((2 / 11) ** 4 + (2 / 11) ** 2) / 2)
         assert row["miss_log10_half_odds"] == pytest.approx(half, rel=1e-13)
+
+    def test_in_a_sweep(self) -> None:
+        """What is later than 0.25 s leaves eight lists of eleven."""
+        sweep = run(masts(1, 0.9, sweep={"latency_s": [0.25]}), [one_walker()]).sweep
+        assert sweep is not None
+        assert sweep["miss_log10"].tolist() == pytest.approx([-8], rel=1e-13)
+        assert sweep["miss_per_logit"].tolist() == pytest.approx([-7.2], rel=1e-13)
+        assert sweep["miss_log10_half_odds"].tolist() == pytest.approx([8 * math.log10(2 / 11)], rel=1e-13)
 
     def test_where_some_are_certain(self) -> None:
         """Over all looks, those that cannot miss included; where none can, there is no logarithm."""
@@ -894,7 +902,7 @@ class TestPassing:
     def test_failing_is_not_one_minus_passing(self) -> None:
         """With 0.9 instead: the first 29 lists miss him with 10⁻²⁹."""
         rows = self.meeting({"kind": "constant", "delay_s": 0.25}, 0.9).summary.set_index("configuration")
-        assert rows.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11)
+        assert rows.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11, abs=0)
         assert rows.loc["GT", "fail_share_exact"] == 0
         assert rows.loc["all", "miss_log10"] == pytest.approx(-51, rel=1e-12)
 
@@ -934,9 +942,9 @@ class TestPassing:
         part = result.exact[result.exact["conflict"] & (result.exact["configuration"] == "all")]
         assert part["fail_probability"].isna().tolist() == [True] * 29 + [False] * 23
         rows = self.meeting(own, 0.5).summary.set_index("configuration")
-        assert rows.loc["all", "fail_share_exact"] == pytest.approx(2.0**-29, rel=1e-6)
+        assert rows.loc["all", "fail_share_exact"] == pytest.approx(2.0**-29, rel=1e-6, abs=0)
         told = self.meeting({"kind": "tests.pipeline.test_closed_form:Told"}, 0.9).summary.set_index("configuration")
-        assert told.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11)
+        assert told.loc["all", "fail_share_exact"] == pytest.approx(1e-29, rel=1e-11, abs=0)
 
     def test_by_hand_with_chance_in_the_reaction(self) -> None:
         """With median 0.6 s: known at t it passes with Φ(ln((3.1 − t) / 0.6) / σ)."""

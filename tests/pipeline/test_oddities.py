@@ -12,9 +12,10 @@ from copem_replay.experiment.file import log_paths
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import memory
+from copem_replay.pipeline import memory, oddities
 from copem_replay.pipeline.log_replay import Replay, prepare
-from copem_replay.pipeline.run import notes_of, run
+from copem_replay.pipeline.oddities import notes_of
+from copem_replay.pipeline.run import run
 from tests.helpers.experiments import TEXT, changed, drive, source_of
 from tests.helpers.recordings import Obj, write_recording
 
@@ -88,6 +89,28 @@ BOTH = [f"drive: unit ego: {UNMET}", f"drive: unit mast: {UNMET}"]
 def test_check_says_it_as_run_does(here: Path, change: str, said: list[str]) -> None:
     assert before(here, changed(change)) == said
     assert after(here, changed(change)) == said
+
+
+@pytest.mark.parametrize("rows", [1, 7, 1000])
+@pytest.mark.parametrize("sample", [1, 5, 1000])
+@pytest.mark.parametrize("rate", ["", ", rate_hz: 10"])
+@pytest.mark.parametrize(
+    ("when", "unmet"),
+    [
+        ("{range_m: [69.9, 71], azimuth_deg: [-1, 1]}", "mast"),  # the oncoming car in the first frame
+        ("{range_m: [39.9, 40.5], azimuth_deg: [-1, 1]}", "mast"),  # in the last one
+        ("{range_m: [54.9, 55.1], azimuth_deg: [-1, 1]}", "mast"),  # in the middle
+        ("{range_m: [12, 13], azimuth_deg: [159, 160]}", "ego"),  # the ego itself, from the mast
+        ("{range_m: [29.9, 30.1], azimuth_deg: [90, 90]}", "mast"),
+    ],
+)
+def test_a_single_encounter_is_found_wherever_it_is(
+    here: Path, monkeypatch: pytest.MonkeyPatch, rows: int, sample: int, rate: str, when: str, unmet: str
+) -> None:
+    monkeypatch.setattr(oddities, "_ROWS", rows)
+    monkeypatch.setattr(oddities, "_SAMPLE", sample)
+    ego = f"  ego: {{on: ego, height_m: 1.8, pem: onboard{rate}}}"
+    assert before(here, changed(couple(when), ego)) == [f"drive: unit {unmet}: {UNMET}"]
 
 
 def test_what_only_a_replay_can_tell_is_said_by_run_alone(here: Path) -> None:

@@ -228,7 +228,9 @@ class TestInTheHead:
             np.testing.assert_array_equal(of(result, name)["conflict_detection_s"], ideal_s)
 
     def test_a_sweep_of_latency(self) -> None:
-        result = replayed(still(), configurations=configurations("gnn"), sweep={"latency_s": [0.0, 0.3]})
+        result = replayed(
+            still(), configurations=configurations("gnn"), sweep={"configurations": ["gnn"], "latency_s": [0.0, 0.3]}
+        )
         assert result.sweep is not None
         rows = result.sweep[result.sweep["configuration"] == "gnn"]
         assert rows[["value", "ttd_median_s"]].to_numpy().tolist() == [[0.0, 0.0], [0.3, pytest.approx(0.3)]]

@@ -207,6 +207,7 @@ class TestWords:
         lines = lines_of(replayed(tmp_path, text))
         assert lines[2].startswith("half and hit knew at the very same times: after ")
         assert not any("No difference" in line or "cannot be told" in line for line in lines)
+        assert "The winners were picked by these same figures, which flatters them a little." not in lines, "no loser"
 
     def test_who_knows_at_once_ties(self, tmp_path: Path) -> None:
         """Of units that surely see both objects at the onset none is the first; of two objects there is no interval."""
@@ -252,6 +253,7 @@ class TestWords:
             best,
         )
         [braking] = [line for line in lines if line.startswith("Braking")]
+        assert "The winners were picked by these same figures, which flatters them a little." in lines
         assert "pass with half, second, 0 % [" in braking
         assert "with late, never" in braking
 

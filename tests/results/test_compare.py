@@ -213,10 +213,11 @@ def test_means_that_are_all_alike_have_no_interval_and_one_that_is_not_brings_it
     assert 0.5 <= time["low"] < time["high"] < 0.75
 
 
-def test_a_median_that_no_resample_moves_keeps_its_interval_where_clusters_differ(tmp_path):
+def test_a_median_that_no_resample_moves_has_no_interval_either(tmp_path):
     rows = [r for k in range(20) for r in pairs_of([(1.0 + (k == 3), 1.0)], object_id=str(k))]
     distance = of(compared(tmp_path, rows), "dad_median_m")
-    assert (distance["low"], distance["high"], distance["interval"]) == (0.0, 0.0, "bootstrap")
+    assert (distance["difference"], distance["interval"]) == (0.0, "all clusters alike")
+    assert distance[["low", "high", "interval_over"]].isna().all()
 
 
 def test_few_objects_have_no_interval_and_that_is_said(tmp_path):

@@ -41,13 +41,6 @@ def test_each_number_draws_its_cluster():
     assert drawn.tolist() == [[1, 1, 1], [3, 0, 0], [0, 1, 2]]
 
 
-def test_resamples_are_as_large_as_the_sample_whatever_their_number():
-    uniform = np.random.default_rng(3).uniform(1e-9, 1, (5000, 1000))  # more than is held at a time
-    drawn = multiplicities(uniform)
-    assert (drawn.sum(axis=1) == 1000).all()
-    assert drawn[4999].tolist() == np.bincount((uniform[4999] * 1000).astype(int), minlength=1000).tolist()
-
-
 @pytest.mark.parametrize("uniform", [np.zeros((2, 0)), np.array([[0.0, 0.5]]), np.array([[0.5, 1.0]]), np.array([0.5])])
 def test_draws_of_other_numbers_are_refused(uniform):
     with pytest.raises(ValueError, match="multiplicities"):

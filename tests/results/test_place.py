@@ -98,6 +98,25 @@ class TestOthers:
         assert sorted(kept.values()) == ["mine\n", "mine, too\n"]
         assert (old / "sweep.csv").read_text().startswith("sweep,value")
 
+    def test_that_can_be_neither_linked_nor_copied(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The results of hours are not thrown away for it."""
+
+        def refused(source: Path, *_: Any, **__: Any) -> None:
+            raise PermissionError(errno.EACCES, "Permission denied", str(source))
+
+        monkeypatch.setattr(os, "link", refused)
+        monkeypatch.setattr(shutil, "copy2", refused)
+        before = written(old)
+        assert again(call).lines == [
+            f"note: out/e: not replaced, as {old}/figures/more/mine.svg can be neither linked nor copied (Permission "
+            f"denied); the results of this run are in {old}-2"
+        ]
+        assert written(old) == before
+        assert json.loads((old.parent / "e-2/provenance.json").read_text())["seed"] == 5
+        assert sorted(os.listdir(old.parent)) == ["e", "e-2"]
+
     def test_that_came_while_the_folder_was_exchanged(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -196,7 +215,8 @@ class TestOneWriter:
         }
         assert found == {"e": 3, "e-2": 2, "e-3": 1}
         assert ended.lines == [
-            f"note: out/e: something else came there during the run, and stays; its results are in {here}/out/e-3"
+            "note: out/e: something else came there during the run, and stays; the results of this run are in "
+            f"{here}/out/e-3"
         ]
         assert ended.out.endswith(f"results in {here}/out/e-3\n")
 

@@ -217,3 +217,13 @@ def test_a_long_recording_is_timed(tmp_path: Path) -> None:
     short, longer, slope = bench_long.long(tmp_path, minutes=(0.05, 0.1), objects=8)
     assert (short["object_states"], longer["object_states"]) == (240, 480)
     assert all(value > 0 for line in (short, longer, slope) for value in line.values())
+    written = (tmp_path / "city.yaml").read_text()
+    assert "# Written by `copem-replay init`, to begin with." in written
+    assert "\nruns: 2 " in written
+
+
+def test_a_crowd_is_timed(tmp_path: Path) -> None:
+    bench._write_truth(tmp_path / "crowd.mcap", bench.boxes(5, 4))
+    line = bench_long.crowd(tmp_path, 5, 4)
+    assert line["crowd_views"] == 5 * 4 * 3
+    assert all(value > 0 for value in line.values())

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.fixed import fixed_in
+from copem_replay.metrics.fixed import NOTHING_DRAWN, fixed_in
 from copem_replay.metrics.summary import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.report.figures.bands import band
@@ -78,13 +78,14 @@ def endings(rows: pd.DataFrame) -> tuple[Float, Int]:
 
 
 def curves_of(results: Results, names: Sequence[str], *, bands: bool = True) -> tuple[str | None, dict[str, Curve]]:
-    """What is resampled whole, and the curves of configurations, with bands where there is something to resample."""
+    """What is resampled whole, or `NOTHING_DRAWN`; and the curves, with bands where there is something to resample."""
     over, cluster = clusters(results.table)
-    fixed = fixed_in(results.experiment.as_written())
+    same = [name for name in names if over == "runs" and fixed_in(results.experiment.as_written()).known(name)]
+    over = NOTHING_DRAWN if same and len(same) == len(names) else over
     curves = {}
     for name in names:
         rows = results.table["configuration"] == name
-        banded = bands and over is not None and not (over == "runs" and fixed.known(name))
+        banded = bands and over is not None and name not in same
         curves[name] = curve_of(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
     return over, curves
 
@@ -182,6 +183,8 @@ def _note(
     if over is None:
         few = f"fewer than {FEWEST_CLUSTERS}"
         bands = f"No bands: {few} logs and {few} objects, and more runs do not tell about other traffic"
+    elif over == NOTHING_DRAWN:
+        bands = "No bands: nothing drawn, every run is the same"
     elif len(names) > MOST_BANDS:
         bands = f"No bands with more than {MOST_BANDS} curves; choose some with --configurations"
     end_s = figure.axes[0].get_xlim()[1]

@@ -153,6 +153,7 @@ def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
 
 
 def _interval_kinds(sweep: pd.DataFrame) -> list[str]:
+    """Of which kinds the limits of shares are, and over what; those that there are none of are not among them."""
     if "interval_over" not in sweep or "interval" not in sweep:
         return []
     there = sweep[["interval", "interval_over"]].dropna().drop_duplicates()
@@ -167,8 +168,8 @@ def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Se
         if kind != "rate_hz":
             rates = list_rates(sweep[sweep["sweep"] == kind], names)
             said.append(f"{AXES.get(kind, kind).partition(' (')[0]}: {rates[:1].lower()}{rates[1:]}" if rates else "")
-    kinds = _interval_kinds(sweep)
-    said.append(f"Bands of shares: 95 %, {'; '.join(kinds)}" if kinds else "No intervals of the shares")
+    limits = _interval_kinds(sweep)
+    said.append(f"Bands of shares: 95 %, {'; '.join(limits)}" if limits else "No intervals of the shares")
     said.append("Dashed black: exact, what the runs tend to" if _any_exact(sweep) else "")
     if "ttd_p95_s" in sweep and sweep["ttd_p95_s"].isna().any():
         said.append(

@@ -131,7 +131,11 @@ def _others(study: Study) -> Iterator[str]:
     if len(unsure):
         yield f"After it, by differences without an interval: {_each(unsure)}."
     if len(later) and len(study.contenders) > 2:
-        yield "The winner was picked by these same figures, which flatters it a little."
+        one = len(same) == 1
+        yield (
+            f"The {'winner was' if one else 'winners were'} picked by these same figures, which flatters "
+            f"{'it' if one else 'them'} a little."
+        )
 
 
 def _each(rows: pd.DataFrame) -> str:
@@ -198,7 +202,7 @@ def _passes(study: Study) -> Iterator[str]:
     said += f"{_share(judged.loc[best])} pass with {some(alike)}"
     if len(alike) < len(share):
         said += f", {_share(judged.loc[worst])} with {some(last)}"
-    if study.regret is not None and best != study.baseline:
+    if study.regret is not None and study.baseline not in alike:
         found = _of(study.regret, "pass_share").set_index("configuration")
         if best in found.index and pd.notna(found.loc[best, "difference"]):
             row = found.loc[best]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from copem_replay.core.tracks import Float
+from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.summary import FEWEST_CLUSTERS
 from copem_replay.metrics.summary_text import cell
 from copem_replay.report.figures.captions import percent
@@ -72,6 +73,8 @@ def _said(drawn: dict[str, Curve], over: str | None, limits: tuple[float, float]
             f"No bands: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} measured objects, and more "
             "runs do not tell about other traffic."
         )
+    elif over == NOTHING_DRAWN:
+        bands = "No bands: nothing drawn, every run is the same."
     else:
         bands += ", in the small figures below." if many else "."
     return [

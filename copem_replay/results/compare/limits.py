@@ -8,12 +8,15 @@ import numpy as np
 
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.intervals import alike_limits, effective_number, percentile_limits
-from copem_replay.results.compare.bootstrap import Clusters, Draws, Whose, clusters, resampled_over
+from copem_replay.results.compare.bootstrap import Draws, Whose, clusters, resampled_over
 from copem_replay.results.compare.differences import Figure
 from copem_replay.results.compare.pairing import Grid
 
 ALL_ALIKE = "all clusters alike"
-"""Why there is no interval: the difference is the same in every cluster, and how it varies is not known."""
+"""Why there is no interval: no resample differs from another, for the difference is the same in every cluster.
+
+Of a median it is enough that it is the same in nearly all.
+"""
 _SAME = 1e-9
 """Differences this close are the same (chosen: below what any of the metrics is measured with)."""
 
@@ -36,7 +39,7 @@ def limits(
     resampled = draws.of(drawn.names)
     low, high = percentile_limits(figure.resampled(drawn, resampled.count), resampled)
     kind = "bootstrap"
-    if abs(high - low) <= _SAME and _alike(figure, drawn):
+    if abs(high - low) <= _SAME:
         if figure.only is None:
             return {"interval": ALL_ALIKE}
         rows = np.bincount(drawn.of[drawn.of >= 0], figure.n[drawn.of >= 0], minlength=len(drawn.names))
@@ -46,10 +49,3 @@ def limits(
         "interval": kind,
         "interval_over": over,
     }
-
-
-def _alike(figure: Figure, drawn: Clusters) -> bool:
-    """Whether each cluster by itself has the same difference; those without any are left out."""
-    alone = figure.resampled(drawn, np.eye(len(drawn.names), dtype=np.uint32))
-    known = alone[~np.isnan(alone)]
-    return bool(len(known) and np.isfinite(known).all() and np.ptp(known) <= _SAME)

@@ -144,7 +144,8 @@ def _on_intervals(overall: pd.DataFrame) -> Iterator[str]:
         )
     if ALL_ALIKE in kinds:
         yield (
-            f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, so that nothing tells how it varies"
+            f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, or a median in nearly all, so that "
+            "nothing tells how it varies"
         )
     if NOTHING_DRAWN in kinds:
         yield f"({_WITHOUT[NOTHING_DRAWN]}): every run is the same, so that an interval over runs would tell nothing"
