@@ -174,6 +174,11 @@ class Tracks:
         bounds = np.searchsorted(self.frame_ix[order], np.arange(len(self.stamp_ns) + 1))
         return order, bounds
 
+    @cached_property
+    def west_to_east(self) -> Int:
+        """(P,) rows list by list, in each from west to east, and at one place the first object first; of one run."""
+        return np.lexsort((self.row_object_ix, self.x_m[0], self.frame_ix))
+
     def take_tracks(self, keep: Bool) -> Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(keep[self.track_ix]))

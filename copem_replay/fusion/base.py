@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
+import numba as nb
 import numpy as np
 
 from copem_replay.core.components import Component, GivenError, asked, wrong
 from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
-from copem_replay.core.tracks import VALUES
+from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int
+
+TellsOf = Literal["capture", "now"]
+"""Of which instant an entry tells: of its newest capture, or of the instant its list is available."""
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 class Fusion(Component, ABC):
@@ -35,10 +40,23 @@ class ListFusion(Fusion):
     """Whether `resume` gives, stretch after stretch of the instants, the very lists of `fuse`; if not, all instants are
     handed over at once. Whoever overrides `fuse` has to say so anew."""
 
+    tells_of: ClassVar[TellsOf] = "capture"
+    """Whether an entry shows the object as it was at its newest capture, or brought to the instant of the list (`now`).
+    What an entry is about is asked of the truth at that instant. A property of the class: never of a configuration, nor
+    of an entry, which could then claim the instant that suits it."""
+
     def __init_subclass__(cls, **given: Any) -> None:
         super().__init_subclass__(**given)
         if "fuse" in vars(cls) and "resumable" not in vars(cls):
             cls.resumable = False
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **given: Any) -> None:
+        super().__pydantic_init_subclass__(**given)
+        if "tells_of" in cls.model_fields:
+            raise TypeError("tells_of: expected a property of the class, `tells_of: ClassVar[TellsOf]`, found a field")
+        if cls.tells_of not in get_args(TellsOf):
+            raise TypeError(f"tells_of: expected {' or '.join(get_args(TellsOf))}, found {cls.tells_of!r}")
 
     @property
     def looks_back_s(self) -> float:
@@ -54,8 +72,9 @@ class ListFusion(Fusion):
         """One fused list per instant and run, `start (S, K + 1)`.
 
         The list of instant k may depend on nothing that arrives later, nor on other runs, nor on the order of
-        entries or units. Of its entries `captured_s` is the newest capture that contributed, `unit_ix` the first unit
-        that did (−1: not said), `track_id` an identity over time (−1: the algorithm keeps none).
+        entries or units. Of its entries `captured_s` is the newest capture that contributed, that of a list that has
+        arrived, `unit_ix` the first unit that did (−1: not said), `track_id` an identity over time (−1: the algorithm
+        keeps none).
         """
 
     def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
@@ -182,9 +201,9 @@ def content_problem(found: Lists, reports: Reports) -> str | None:
     ee, en, nn = (found.entries[name] for name in COVARIANCES)
     if ((ee <= 0) | (nn <= 0) | (ee * nn - en * en <= 0)).any():
         return "cov_*_m2: expected positive definite covariances"
-    now_s = np.repeat(np.tile(reports.issue_s, len(found.start)), np.diff(found.start, axis=1).ravel())
-    if (found.entries["captured_s"] > now_s + 1e-6).any():
-        return "captured_s: expected captures that are not in the future"
+    if not (had := _had(found, reports)).all():
+        wrong = float(found.entries["captured_s"][np.argmin(had)])
+        return f"captured_s: expected the capture of a list that has arrived, found {wrong:.9g} s"
     tracked = found.entries["track_id"] >= 0
     of_list = np.repeat(np.arange(found.start[:, 1:].size), np.diff(found.start, axis=1).ravel())[tracked]
     order = np.lexsort((found.entries["track_id"][tracked], of_list))
@@ -195,6 +214,36 @@ def content_problem(found: Lists, reports: Reports) -> str | None:
     if ((unit_ix < -1) | (unit_ix >= len(reports.units))).any():
         return f"unit_ix: expected −1 … {len(reports.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"
     return None
+
+
+def _had(found: Lists, reports: Reports) -> Bool:
+    """(N,) whether a list that was captured when an entry says so has arrived when the entry's list is issued."""
+    captured_s, which = np.unique(reports.captured_s, return_inverse=True)
+    first_s = np.full(len(captured_s), np.inf)
+    np.minimum.at(first_s, which, reports.arrives_s)
+    had: Bool = np.zeros(len(found.entries), dtype=bool)
+    if len(captured_s):
+        _find_had(found.start, found.entries["captured_s"], reports.issue_s, captured_s, first_s, _TOLERANCE_S, had)
+    return had
+
+
+@nb.njit(cache=True, nogil=True)
+def _find_had(
+    start: Int, entry_s: Float, issue_s: Float, captured_s: Float, first_s: Float, tolerance_s: float, had: Bool
+) -> None:
+    for s in range(len(start)):
+        f = 0
+        for k in range(len(issue_s)):
+            for i in range(start[s, k], start[s, k + 1]):
+                from_s = entry_s[i] - tolerance_s
+                # Entries of one list were mostly captured together, so the last place is tried first.
+                if captured_s[f] < from_s or (f > 0 and captured_s[f - 1] >= from_s):
+                    f = np.searchsorted(captured_s, from_s)
+                q = f
+                while q < len(captured_s) and captured_s[q] <= entry_s[i] + tolerance_s and not had[i]:
+                    had[i] = first_s[q] <= issue_s[k] + tolerance_s
+                    q += 1
+                f = min(f, len(captured_s) - 1)
 
 
 def inbox_at(reports: Reports, run: int, instant: int) -> Inbox:

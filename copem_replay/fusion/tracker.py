@@ -14,7 +14,7 @@ from copem_replay.core.components import NotNegative, Positive, Share
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.object_list import ENTRY, Lists, Reports
 from copem_replay.core.tracks import Float, Int
-from copem_replay.fusion.base import ListFusion
+from copem_replay.fusion.base import ListFusion, TellsOf
 from copem_replay.fusion.content_order import rows_in_order
 from copem_replay.fusion.tracker_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
 from copem_replay.fusion.tracker_memory import Remembered, nothing_yet
@@ -67,6 +67,8 @@ class Tracker(ListFusion):
         return self
 
     resumable: ClassVar[bool] = True
+    # `stale`, too: what is late is taken for the present, so that is what it claims to show.
+    tells_of: ClassVar[TellsOf] = "now"
 
     @property
     def looks_back_s(self) -> float:

@@ -1,8 +1,10 @@
 """Which true object is each entry of a fused list about? List by list, for every fusion that goes without truth ids.
 
-An object is *within the gate* of an entry when it is there at the list's instant, the horizontal distance of their
-centres is at most the gate, and their classes agree (`core/agree.py`; of the entry the most probable one). All true
-objects of the instant count, measured or not, moving or not, the ego too: an entry at one of them is no ghost.
+An entry *tells of* one instant: of its newest capture, or, where the fusion brings its entries to the present, of the
+instant the list is available (`ListFusion.tells_of`). An object is *within the gate* of an entry when it is there at
+that instant, the horizontal distance of their centres is at most the gate, and their classes agree
+(`core/agree.py`; of the entry the most probable one). In a gap of the truth nobody is there. All true objects of the
+instant count, measured or not, moving or not, the ego too: an entry at one of them is no ghost.
 
 1. Every entry belongs to the nearest object within its gate. Of several at one object the *preferred* one is its
    match: the highest existence, then the first unit's (last where it is not said), then the smaller x, the smaller y;
@@ -11,12 +13,17 @@ objects of the instant count, measured or not, moving or not, the ego too: an en
    of two pedestrians side by side the entries of both may lie nearer to one of them.
 3. What is then left is a duplicate of its nearest object, or a ghost where there is none within the gate.
 
-The order of the entries in a list does not matter. Source: the contract, "What the words mean".
+Entries of one list may tell of different instants; an object has one match in a list, whichever they are. The order of
+the entries in a list does not matter. Source: the contract, "What the words mean".
+
+What a list is worth *now* is another question: there all entries are taken as if they told of the instant the list is
+available. Holding on to what has long been gone does not pay.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -25,34 +32,86 @@ from numpy.typing import NDArray
 from copem_replay.core.agree import AGREE
 from copem_replay.core.agree import most_probable as most_probable_class
 from copem_replay.core.object_list import Entries, Lists
-from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.fusion.base import TellsOf
 
 MATCH, DUPLICATE, GHOST = 0, 1, 2
 """Roles of entries."""
 
 _TOLERANCE_M = 1e-9
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
 class Matches:
-    """What each entry of Lists is. Both (N,)."""
+    """What each entry of Lists is. All (N,)."""
 
     object_ix: Int  # the object it is about, −1: none
     role: NDArray[np.int8]  # MATCH, DUPLICATE or GHOST
+    x_m: Float  # where that object is at the instant asked for; means nothing where there is none
+    y_m: Float
+    class_ix: NDArray[np.int8]  # its own most probable class
 
 
-def match(lists: Lists, world: Tracks, scene: Scene, *, gate_m: float) -> Matches:
-    """Objects and roles of the entries of K lists in S runs. `world`: the truth, frame k at the instant of list k."""
-    out = Matches(np.full(len(lists.entries), -1), np.full(len(lists.entries), GHOST, dtype=np.int8))
+def match(lists: Lists, world: Tracks, scene: Scene, *, gate_m: float, tells_of: TellsOf = "now") -> Matches:
+    """What the entries of K lists in S runs are about, at the instants they tell of.
+
+    `world`: the truth. Where entries tell of `now` its frame k is at the instant list k is available, where they tell
+    of their `capture` frames are ascending, at all captures that these entries name, at least.
+    """
+    out = _nothing(lists)
+    rows = _rows(world, scene, by_frame=tells_of == "now")
+    _match(lists.start, lists.entries, rows, rows, AGREE, gate_m + _TOLERANCE_M, out, out)
+    return Matches(*out)
+
+
+def match_both(lists: Lists, then: Tracks, now: Tracks, scene: Scene, *, gate_m: float) -> tuple[Matches, Matches]:
+    """What entries that tell of their `capture` are about; and what they would be about if they told of `now`.
+
+    `then`, `now`: the truth, as `match` has it for these.
+    """
+    about = _nothing(lists)
+    at_once = _nothing(lists)._replace(class_ix=about.class_ix)
+    rows = _rows(then, scene, by_frame=False), _rows(now, scene, by_frame=True)
+    _match(lists.start, lists.entries, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once)
+    return Matches(*about), Matches(*at_once)
+
+
+class _Out(NamedTuple):
+    # As `Matches`.
+    object_ix: Int
+    role: NDArray[np.int8]
+    x_m: Float
+    y_m: Float
+    class_ix: NDArray[np.int8]
+
+
+def _nothing(lists: Lists) -> _Out:
+    N = len(lists.entries)
+    none = np.full(N, GHOST, dtype=np.int8)
+    return _Out(np.full(N, -1), none, np.empty(N), np.empty(N), np.empty(N, dtype=np.int8))
+
+
+class _Rows(NamedTuple):
+    # The truth: frame f, at `frame_s[f]`, is rows `bounds[f] : bounds[f + 1]`, in each from west to east.
+    by_frame: bool  # frame k goes with list k, whatever its entries tell of
+    frame_s: Float
+    bounds: Int
+    object_ix: Int
+    class_ix: NDArray[np.int8]
+    x_m: Float
+    y_m: Float
+    match_of: Int  # by object its match in the list at hand, −1: none
+
+
+def _rows(world: Tracks, scene: Scene, *, by_frame: bool) -> _Rows:
     _, bounds = world.by_frame
-    # List by list, and in each from west to east; at one place the first object first.
-    order = np.lexsort((world.row_object_ix, world.x_m[0], world.frame_ix))
+    order = world.west_to_east
     object_ix = world.row_object_ix[order]
-    _match(
-        lists.start, lists.entries, bounds, object_ix, scene.object_class[object_ix], world.x_m[0, order],
-        world.y_m[0, order], AGREE, gate_m + _TOLERANCE_M, out.object_ix, out.role,
+    return _Rows(
+        by_frame, world.captured_s, bounds, object_ix, scene.object_class[object_ix], world.x_m[0, order],
+        world.y_m[0, order], np.full(int(object_ix.max(initial=-1)) + 1, -1),
     )  # fmt: skip
-    return out
 
 
 @nb.njit(cache=True, nogil=True)
@@ -63,54 +122,109 @@ def most_probable(entries: Entries, i: int) -> int:
 
 @nb.njit(cache=True, nogil=True)
 def _match(
-    start: Int, entries: Entries, bounds: Int, object_ix: Int, class_ix: NDArray[np.int8], x_m: Float, y_m: Float,
-    agree: Bool, gate_m: float, out_object_ix: Int, out_role: NDArray[np.int8],
-) -> None:  # fmt: skip
-    match_of = np.full(len(object_ix), -1)  # by row of the truth: its match in the list at hand
-    longest = 0
+    start: Int, entries: Entries, rows: _Rows, now: _Rows, agree: Bool, gate_m: float, about: _Out, at_once: _Out
+) -> None:
+    # `now`, `at_once`: the second question; the same as the first one where there is none.
+    longest, both = 0, rows.by_frame != now.by_frame
     for s in range(len(start)):
-        for k in range(len(bounds) - 1):
+        for k in range(start.shape[1] - 1):
             longest = max(longest, start[s, k + 1] - start[s, k])
-    others = np.empty(longest, np.int64)
-    for k in range(len(bounds) - 1):
-        low, high = bounds[k], bounds[k + 1]
+    # Of the list at hand: with which frame each entry is compared, and those that are to be asked again.
+    frame, others = np.empty(longest, np.int64), np.empty(longest, np.int64)
+    for k in range(start.shape[1] - 1):
         for s in range(len(start)):
-            match_of[low:high] = -1
-            for i in range(start[s, k], start[s, k + 1]):
-                fits = agree[most_probable(entries, i)]
-                p = _nearest(entries, i, gate_m, fits, low, high, class_ix, x_m, y_m, match_of, False)
-                if p >= 0:
-                    out_object_ix[i], out_role[i] = object_ix[p], DUPLICATE
-                    if match_of[p] < 0 or _preferred(entries, i, match_of[p]):
-                        match_of[p] = i
-            for p in range(low, high):
-                if match_of[p] >= 0:
-                    out_role[match_of[p]] = MATCH
-            # Most duplicates have no other object near: only those that have are put in order.
-            n = 0
-            for i in range(start[s, k], start[s, k + 1]):
-                if out_role[i] == DUPLICATE:
-                    fits = agree[most_probable(entries, i)]
-                    if _nearest(entries, i, gate_m, fits, low, high, class_ix, x_m, y_m, match_of, True) >= 0:
-                        others[n] = i
-                        n += 1
-            _in_order_of_preference(entries, others, n)
-            for i in others[:n]:
-                fits = agree[most_probable(entries, i)]
-                p = _nearest(entries, i, gate_m, fits, low, high, class_ix, x_m, y_m, match_of, True)
-                if p >= 0:
-                    out_object_ix[i], out_role[i], match_of[p] = object_ix[p], MATCH, i
+            first, n = start[s, k], start[s, k + 1] - start[s, k]
+            for i in range(first, first + n):
+                about.class_ix[i] = most_probable_class(entries[i].class_probability)
+            frame[:n] = k
+            if not rows.by_frame:
+                _find_frames(entries, first, rows.frame_s, frame[:n])
+            _one_list(entries, first, frame[:n], others, rows, agree, gate_m, about)
+            if not both:
+                continue
+            late = False
+            for f in frame[:n]:
+                late |= f < 0 or rows.frame_s[f] != now.frame_s[k]
+            if late:
+                frame[:n] = k
+                _one_list(entries, first, frame[:n], others, now, agree, gate_m, at_once)
+            else:
+                for i in range(first, first + n):
+                    at_once.object_ix[i], at_once.role[i] = about.object_ix[i], about.role[i]
+                    at_once.x_m[i], at_once.y_m[i] = about.x_m[i], about.y_m[i]
+
+
+@nb.njit(cache=True, nogil=True)
+def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None:
+    # The frame at the capture of each entry of a list, −1: there is none.
+    f, last = 0, len(frame_s) - 1
+    for j in range(len(out)):
+        at_s = entries[first + j].captured_s
+        if last >= 0 and frame_s[f] != at_s:  # entries of one list were mostly captured together
+            f = min(np.searchsorted(frame_s, at_s), last)
+            if f > 0 and at_s - frame_s[f - 1] < frame_s[f] - at_s:
+                f -= 1
+        out[j] = f if last >= 0 and abs(frame_s[f] - at_s) <= _TOLERANCE_S else -1
+
+
+@nb.njit(cache=True, nogil=True)
+def _one_list(
+    entries: Entries, first: int, frame: Int, others: Int, rows: _Rows, agree: Bool, gate_m: float, out: _Out
+) -> None:
+    bounds, row_object_ix, row_class_ix = rows.bounds, rows.object_ix, rows.class_ix
+    row_x_m, row_y_m = rows.x_m, rows.y_m
+    object_ix, role, class_ix, match_of = out.object_ix, out.role, out.class_ix, rows.match_of
+    n = 0
+    for again in range(2):
+        # At first all, then those at an object whose match is another: most of them have no other one near, and only
+        # those that have are put in order.
+        for j in range(len(frame)):
+            i = first + j
+            if again and (role[i] != DUPLICATE or match_of[object_ix[i]] == i):
+                continue
+            p = -1
+            if frame[j] >= 0:
+                p = _nearest(
+                    entries[i].x_m, entries[i].y_m, bounds[frame[j]], bounds[frame[j] + 1], gate_m, agree[class_ix[i]],
+                    row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, again == 1,
+                )  # fmt: skip
+            if p < 0:
+                continue
+            if again:
+                others[n] = i
+                n += 1
+                continue
+            o = row_object_ix[p]
+            object_ix[i], role[i], out.x_m[i], out.y_m[i] = o, DUPLICATE, row_x_m[p], row_y_m[p]
+            if match_of[o] < 0 or _preferred(entries, i, match_of[o]):
+                match_of[o] = i
+    for i in range(first, first + len(frame)):
+        if role[i] == DUPLICATE and match_of[object_ix[i]] == i:
+            role[i] = MATCH
+    _in_order_of_preference(entries, others, n)
+    for i in others[:n]:
+        f = frame[i - first]
+        p = _nearest(
+            entries[i].x_m, entries[i].y_m, bounds[f], bounds[f + 1], gate_m, agree[class_ix[i]],
+            row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True,
+        )  # fmt: skip
+        if p >= 0:
+            o = row_object_ix[p]
+            object_ix[i], role[i], out.x_m[i], out.y_m[i] = o, MATCH, row_x_m[p], row_y_m[p]
+            match_of[o] = i
+    for i in range(first, first + len(frame)):
+        if role[i] == MATCH:
+            match_of[object_ix[i]] = -1
 
 
 @nb.njit(cache=True, nogil=True)
 def _nearest(
-    entries: Entries, i: int, gate_m: float, fits: Bool, low: int, high: int, class_ix: NDArray[np.int8],
+    x: float, y: float, first: int, high: int, gate_m: float, fits: Bool, object_ix: Int, class_ix: NDArray[np.int8],
     x_m: Float, y_m: Float, match_of: Int, only_free: bool,
 ) -> int:  # fmt: skip
-    # The row of the truth, of low … high − 1, nearest to entry i and within its gate (at a tie the western); −1: none.
-    x, y = entries[i].x_m, entries[i].y_m
+    # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western); −1: none.
     least, best = gate_m * gate_m, -1
-    first, after = low, high
+    after = high
     while first < after:  # the first row that is not too far west
         middle = (first + after) // 2
         if x_m[middle] < x - gate_m:
@@ -120,7 +234,7 @@ def _nearest(
     for p in range(first, high):
         if x_m[p] > x + gate_m:
             break
-        if not fits[class_ix[p]] or (only_free and match_of[p] >= 0):
+        if not fits[class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
             continue
         square = (x_m[p] - x) ** 2 + (y_m[p] - y) ** 2
         if square < least or (square == least and best < 0):

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Bool, Float
-from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.metrics.accuracy.metrics import FIGURES, beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import Total
 from copem_replay.metrics.braking.driver import UNRESOLVED
 from copem_replay.metrics.fixed import NOTHING_DRAWN, Fixed
@@ -28,6 +28,8 @@ from copem_replay.metrics.survival import (
     wilson,
 )
 
+MUCH_BEYOND = 0.01
+"""From this share of errors beyond the gate on it is said (chosen)."""
 FEWEST_CLUSTERS = 5
 """Fewer logs or objects than this are not resampled (the contract's)."""
 
@@ -67,6 +69,7 @@ def summary(
     parts = _by_configuration(table)
     exactly = _by_configuration(exact) if exact is not None else {}
     rows = []
+    notes += _beyond_the_gate(accuracy or {})
     for name in configurations:
         part = parts.get(name, table.iloc[:0])
         row: dict[str, object] = {"configuration": name, "n": len(part), "list_rate_hz": list_rate_hz[name]}
@@ -81,6 +84,20 @@ def summary(
             row |= _exactly(exactly.get(name, exact.iloc[:0]), horizon_s, len(part))
         rows.append(row)
     return pd.DataFrame(rows), notes
+
+
+def _beyond_the_gate(accuracy: Mapping[str, Total]) -> list[str]:
+    """Where covariances as large as claimed have some errors that the gate lets not through."""
+    shares = {name: beyond_gate_share(of) or 0.0 for name, of in accuracy.items()}
+    cut = {name: share for name, share in shares.items() if share >= MUCH_BEYOND}
+    if not cut:
+        return []
+    gate_m = accuracy[next(iter(cut))].settings.gate_m
+    said = ", ".join(f"{name} {share:.2g}" for name, share in cut.items())
+    return [
+        f"of errors as the claimed covariances have them this share is beyond the gate of {gate_m:g} m: {said}; it is "
+        "in no RMSE and no NEES, which is nees_expected, not 2, where covariances are true (`measure.match.gate_m`)"
+    ]
 
 
 def _by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:

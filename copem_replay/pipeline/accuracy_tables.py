@@ -4,7 +4,7 @@
 |---|---|
 | `accuracy` | as `detections`: by list of the object's stay its position error, and its part of GOSPAᵖ; its ghosts |
 | `instants` | log × configuration: when each fused list was available |
-| `lists` | log × configuration × run: lists, ghosts, and how many ghosts there are from which existence on |
+| `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |
 | `bands` | configuration × distance, time (by log) or existence: from, to, and the figures in between |
 """
@@ -43,11 +43,12 @@ def _row_columns(accuracy: Accuracy) -> dict[str, Any]:
 
     return {
         "matched_lists": sums["pairs"],
-        "position_rmse_m": np.sqrt(mean("square_m2")),
-        "position_rmse_captured_m": np.sqrt(mean("square_captured_m2", "pairs_captured")),
-        "bias_east_m": mean("east_m"),
-        "bias_north_m": mean("north_m"),
-        "velocity_rmse_mps": np.sqrt(mean("velocity_square_m2ps2")),
+        "unplaced_lists": sums["pairs"] - sums["placed"],
+        "position_rmse_m": np.sqrt(mean("square_m2", "placed")),
+        "position_rmse_captured_m": np.sqrt(mean("square_then_m2")),
+        "bias_east_m": mean("east_m", "placed"),
+        "bias_north_m": mean("north_m", "placed"),
+        "velocity_rmse_mps": np.sqrt(mean("velocity_square_m2ps2", "placed")),
         "nees": mean("nees"),
         "age_s": mean("age_s"),
         "identity_switches": np.where(sums["tracked"] > 0, sums["switches"], np.nan),
@@ -171,6 +172,7 @@ def _lists(outcomes: Sequence[Outcome]) -> pa.Table:
                         "lists": int(sums["lists"]),
                         "minutes": float(sums["time_s"]) / 60,
                         "ghosts": int(sums["ghosts"]),
+                        "stale_ghosts": int(sums["stale_ghosts"]),
                         "duplicates": int(sums["duplicates"]),
                         "existence": list(one.settings.existence_thresholds),
                         "ghosts_at": one.ghosts_at[s].tolist(),
@@ -181,7 +183,7 @@ def _lists(outcomes: Sequence[Outcome]) -> pa.Table:
     schema = pa.schema(
         [
             ("log", pa.string()), ("configuration", pa.string()), ("run", pa.int64()), ("lists", pa.int64()),
-            ("minutes", pa.float64()), ("ghosts", pa.int64()), ("duplicates", pa.int64()),
+            ("minutes", pa.float64()), ("ghosts", pa.int64()), ("stale_ghosts", pa.int64()), ("duplicates", pa.int64()),
             ("existence", pa.list_(pa.float64())), ("ghosts_at", pa.list_(pa.int64())),
         ]
     )  # fmt: skip
@@ -233,7 +235,7 @@ def bands(outcomes: Sequence[Outcome]) -> pd.DataFrame:
     for (log, name), of in _by_log(outcomes).items():
         rows += _band_rows(name, "time_s", of.settings.time_edges_s, of.by_time, log)
     columns = ["log", "configuration", "by", "from", "to", "looked", "missed_share", "ghosts", "pairs",
-               "position_rmse_m", "bias_east_m", "bias_north_m", "nees", "entries", "existence",
+               "position_rmse_m", "bias_east_m", "bias_north_m", "nees", "nees_expected", "entries", "existence",
                "with_object_share"]  # fmt: skip
     return pd.DataFrame(rows, columns=columns)
 
@@ -249,9 +251,10 @@ def _band_rows(name: str, by: str, edges: Sequence[float], sums: Any, log: str |
             "looked": int(one["looked"]), "ghosts": int(one["ghosts"]), "pairs": pairs,
             "missed_share": one["missed"] / one["looked"] if one["looked"] else np.nan,
         }  # fmt: skip
+        if placed := int(one["placed"]):
+            row["position_rmse_m"] = np.sqrt(one["square_m2"] / placed)
+            row |= {"bias_east_m": one["east_m"] / placed, "bias_north_m": one["north_m"] / placed}
         if pairs:
-            row["position_rmse_m"] = np.sqrt(one["square_m2"] / pairs)
-            row |= {"bias_east_m": one["east_m"] / pairs, "bias_north_m": one["north_m"] / pairs}
-            row["nees"] = one["nees"] / pairs
+            row |= {"nees": one["nees"] / pairs, "nees_expected": one["nees_expected"] / pairs}
         rows.append(row)
     return rows

@@ -17,7 +17,7 @@ from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
+from copem_replay.fusion.base import Ideal, ListFusion, TellsOf, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
 from copem_replay.perception.observation import Candidates
@@ -51,7 +51,8 @@ class Believed:
     """What one configuration's receiver believes in the runs (S,) at its instants, `at`.
 
     `belief`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without truth ids,
-    or what another fusion gave; one run where all runs agree.
+    or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell; `whole`: the
+    instants are all there are, not those of a stretch.
     """
 
     heard: Tracks
@@ -59,6 +60,8 @@ class Believed:
     belief: Belief | None
     scene: Scene
     fused: Lists | None
+    tells_of: TellsOf = "capture"
+    whole: bool = True
 
     @cached_property
     def lists(self) -> Lists:
@@ -145,6 +148,7 @@ class Receivers:
             if name not in self._instants:
                 self._instants[name] = instants(heard, max_age_s=max_age_s)
             at = self._instants[name].between(world.stretch.from_s, world.stretch.until_s)
+            whole = world.stretch == WHOLE
             if isinstance(fusion, ListFusion):
                 if not without_truth:
                     without_truth.append(_without_truth(world, seen_in("sampled"), self._runs))
@@ -154,14 +158,14 @@ class Receivers:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
                 else:  # such a log is one stretch
                     fused = fused_by(fusion, told, where)
-                yield name, Believed(heard, at, None, world.scene, fused)
+                yield name, Believed(heard, at, None, world.scene, fused, fusion.tells_of, whole)
                 continue
             belief = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
             if not of_truth and world.recorded is None:
                 belief = replace(belief, look=world.found.look)
             if posterior:
                 belief = draw_posterior(belief, world.scene, experiment.seed, self._runs)
-            yield name, Believed(heard, at, belief, world.scene, None)
+            yield name, Believed(heard, at, belief, world.scene, None, whole=whole)
 
 
 def believe(world: World, runs: Int, there: Bool | None) -> Iterator[tuple[str, Believed]]:

@@ -1,4 +1,8 @@
-"""Appraise: how good were a configuration's fused lists? Matched with the truth at the instant each was available."""
+"""Appraise: how good were a configuration's fused lists?
+
+What is said of an object is matched with the truth at the instant it tells of, what a list is worth now with the truth
+at the instant it was available (`metrics/matching.py`).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from copem_replay.metrics.config import Measure
 from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.episodes import Looks, Reference, measured_objects, reference_at
-from copem_replay.metrics.matching import Matches, match
+from copem_replay.metrics.matching import Matches, match, match_both
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.receiver import Believed
@@ -86,8 +90,30 @@ class Appraisal:
 
 
 def match_lists(around: Surroundings, believed: Believed, measure: Measure) -> Matches:
-    """Which true object each entry of the fused lists is about."""
-    return match(believed.lists, around.at(believed.at.issue_s), around.scene, gate_m=measure.match.gate_m)
+    """Which true object each entry of the fused lists is about, at the instant it tells of."""
+    world = around.at(believed.at.issue_s if believed.tells_of == "now" else _captures(believed))
+    return match(believed.lists, world, around.scene, gate_m=measure.match.gate_m, tells_of=believed.tells_of)
+
+
+def _match_both(around: Surroundings, believed: Believed, measure: Measure) -> tuple[Matches, Matches]:
+    """The same, and if all entries told of the instant their list is available."""
+    if believed.tells_of == "now":
+        matches = match_lists(around, believed, measure)
+        return matches, matches
+    then, now = around.at(_captures(believed)), around.at(believed.at.issue_s)
+    return match_both(believed.lists, then, now, around.scene, gate_m=measure.match.gate_m)
+
+
+def _captures(believed: Believed) -> Float:
+    """Captures, ascending: all that the entries name, at least; of a log in one piece all that were heard."""
+    captures: Float = np.unique(believed.heard.captured_s)
+    if believed.whole:
+        return captures
+    # Those next to what is named, before and after.
+    after = np.searchsorted(captures, believed.lists.entries["captured_s"])
+    used = np.zeros(len(captures) + 1, dtype=bool)
+    used[after] = used[np.maximum(after - 1, 0)] = True
+    return captures[used[:-1]]
 
 
 class Appraiser:
@@ -104,7 +130,6 @@ class Appraiser:
             looks, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
             captures=captures_of(believed.heard),
         )  # fmt: skip
-        self._captures: Float = np.unique(believed.heard.captured_s)
         self._assessment = None
         if measure.accuracy:
             self._assessment = Assessment(
@@ -114,23 +139,16 @@ class Appraiser:
 
     def add(self, around: Surroundings, believed: Believed) -> Matches:
         """Take in the lists of a stretch; what they are about."""
-        matches = match_lists(around, believed, self._measure)
         lists, issue_s = believed.lists, believed.at.issue_s
-        self._known.add(lists, matches, issue_s)
-        if self._assessment is not None:
+        if self._assessment is None:
+            about = match_lists(around, believed, self._measure)
+        else:
             began_s = time.perf_counter()
-            whole = len(issue_s) == len(self._issue_s)
-            captures = self._captures if whole else self._next_to(lists.entries["captured_s"])
-            self._assessment.add(lists, matches, around.at(issue_s), around.at(captures))
+            about, now = _match_both(around, believed, self._measure)
+            self._assessment.add(lists, about, now, around.at(issue_s))
             self.accuracy_s += time.perf_counter() - began_s
-        return matches
-
-    def _next_to(self, captured_s: Float) -> Float:
-        """The captures that are next to instants (N,), before and after."""
-        after = np.searchsorted(self._captures, captured_s)
-        used = np.zeros(len(self._captures) + 1, dtype=bool)
-        used[after] = used[np.maximum(after - 1, 0)] = True
-        return self._captures[used[:-1]]
+        self._known.add(lists, about, issue_s)
+        return about
 
     def result(self, runs: int) -> Appraisal:
         """All of it, for each of so many runs."""
@@ -159,6 +177,7 @@ def settings_of(measure: Measure, end_s: float) -> Settings:
     step_s = max(1, int(np.ceil(end_s / TIME_BANDS)))
     return Settings(
         cutoff_m,
+        measure.match.gate_m,
         measure.gospa.power,
         DISTANCE_EDGES_M,
         tuple(float(edge) for edge in range(0, int(end_s) + 1 + step_s, step_s)),

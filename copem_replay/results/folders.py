@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import TRUTH
 from copem_replay.core.yaml import NotYamlError, read
 from copem_replay.metrics.config import Measure
 from copem_replay.metrics.fixed import Fixed, fixed_in
@@ -76,6 +77,7 @@ class Folder:
     ego: object
     fixed: Fixed  # what is the same in every run
     by_truth_id: frozenset[str]  # configurations that detect by truth id: the truth, and ideal fusion
+    truth: frozenset[str]  # configurations that are the truth
     horizon_used_s: float | None
     tables: dict[str, pa.Table]
 
@@ -113,10 +115,13 @@ def read_folder(path: Path) -> Folder:
     experiment = _experiment(path / "experiment.yaml")
     check_still(path, seen)
     always = bool(fields["measure"]["match"].get("always"))
-    by_id = frozenset() if always else frozenset(_by_truth_id(experiment.get("configurations")))
+    said = _configurations(experiment)
+    by_id = frozenset() if always else frozenset(name for name, one in said.items() if _knows_ids(one))
+    truth = frozenset(name for name, one in said.items() if one.get("units") == TRUTH)
     return Folder(
-        path=path, ego=experiment.get("ego"), by_truth_id=by_id, fixed=fixed_in(experiment), tables=tables, **fields
-    )
+        path=path, ego=experiment.get("ego"), by_truth_id=by_id, truth=truth, fixed=fixed_in(experiment),
+        tables=tables, **fields,
+    )  # fmt: skip
 
 
 def _rowless(path: Path) -> bool:
@@ -153,12 +158,16 @@ def _provenance(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {_AGAIN}") from None
 
 
-def _by_truth_id(configurations: object) -> Iterator[str]:
-    """Configurations that need no match with the truth to know an object."""
-    for name, said in configurations.items() if isinstance(configurations, dict) else ():
-        fusion = said.get("fusion") if isinstance(said, dict) else None
-        if isinstance(said, dict) and (fusion is None or fusion.get("kind", "ideal") == "ideal"):
-            yield str(name)
+def _configurations(experiment: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What is said of each configuration."""
+    said = experiment.get("configurations")
+    return {str(name): one for name, one in said.items() if isinstance(one, dict)} if isinstance(said, dict) else {}
+
+
+def _knows_ids(configuration: dict[str, Any]) -> bool:
+    """Whether a configuration needs no match with the truth to know an object."""
+    fusion = configuration.get("fusion")
+    return fusion is None or bool(fusion.get("kind", "ideal") == "ideal")
 
 
 def _experiment(path: Path) -> dict[str, Any]:

@@ -339,6 +339,7 @@ IN_PLANE = "expected two numbers, in the plane"
 HOW_MANY = "expected how many units beside the ego's, such as 2 (a count, no names)"
 SEEDS = st.integers(-(2**63), 2**64 - 1)
 SEED = "4: seed: expected a whole number of 64 bits (-2^63 … 2^64 - 1), found "
+A_TURN = "expected degrees from -360 to 360"
 EITHER = "expected one of `pem: <name>` and `recorded: {topic: …}`"
 RECORDED = "recorded: goes with one place, `on` an object or `at` a point, and without rate_hz"
 PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`"
@@ -380,8 +381,8 @@ CASES = [
     (WHEN, "range_m: [0, 1, 2]", ".range_m: expected at most 2 in the list, found [0, 1, 2]"),
     (WHEN, "range: [0, 1]", ".range: unknown key; did you mean range_m?"),
     (WHEN, "azimuth_deg: [1]", ".azimuth_deg[1]: missing"),
-    (WHEN, "azimuth_deg: [-400, 60]", ".azimuth_deg: expected degrees from -360 to 360, found -400"),
-    (WHEN, "azimuth_deg: [0, 360.5]", ".azimuth_deg: expected degrees from -360 to 360, found 360.5"),
+    (WHEN, "azimuth_deg: [-400, 60]", f".azimuth_deg: {A_TURN}, found -400 (through 0: [350, 10])"),
+    (WHEN, "azimuth_deg: [0, 360.5]", f".azimuth_deg: {A_TURN}, found 360.5 (through 0: [350, 10])"),
     (WHEN, "classes: car", ".classes: expected a list, found 'car'"),
     (WHEN, "classes: []", ".classes: expected at least 1 in the list, found []"),
     (WHEN, "classes: [car, cow]", f".classes[1]: expected one of {CLASSES}; found 'cow'"),

@@ -33,6 +33,7 @@ class Walk(StepFusion):
         count = (memory or 0) + len(inbox.arrived)
         entries = entries_of(count % 7)
         entries["cov_ee_m2"] = entries["cov_nn_m2"] = 1.0
+        entries["captured_s"] = inbox.arrived[-1].captured_s
         entries["x_m"] = [one.entries["x_m"].sum() for one in inbox.arrived][-1] + np.arange(len(entries))
         return entries, count
 
@@ -204,13 +205,16 @@ class AllOfThem(Union):
         return reports.lists, memory
 
 
+HERE = r" \(.*test_chunks.py:\d+\)$"
+
+
 @pytest.mark.parametrize(
     ("fusion", "said"),
     [
-        (NoMemory, r"NoMemory: resume: expected Lists and a memory, found Lists$"),
-        (TooSure, r"TooSure: existence: expected probabilities, found 2 … 2$"),
-        (Crashes, r"Crashes: KeyError: 'gone' \(.*test_chunks.py:\d+\)$"),
-        (AllOfThem, r"AllOfThem: fuse: expected lists of ENTRY with start \(1, 3\), found .* with start \(1, 37\)$"),
+        (NoMemory, rf"NoMemory: resume: expected Lists and a memory, found Lists{HERE}"),
+        (TooSure, rf"TooSure: existence: expected probabilities, found 2 … 2{HERE}"),
+        (Crashes, rf"Crashes: KeyError: 'gone'{HERE}"),
+        (AllOfThem, rf"AllOfThem: fuse: expected lists of ENTRY with start \(1, 3\), .* with start \(1, 37\){HERE}"),
     ],
 )
 def test_a_wrong_answer_is_named_by_its_place(fusion: type[ListFusion], said: str) -> None:

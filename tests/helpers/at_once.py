@@ -15,10 +15,10 @@ from copem_replay.metrics.matching import Matches
 
 def assess(
     lists: Lists,
-    matches: Matches,
+    about: Matches,
+    now: Matches,
     issue_s: Float,
     world: Tracks,
-    truth_at_capture: Tracks,
     scene: Scene,
     looks: Looks,
     stay_from_s: Float,
@@ -27,11 +27,11 @@ def assess(
     *,
     settings: Settings,
 ) -> Accuracy:
-    """Add up how far off all lists are at once: what `Assessment` is given, with the truth at all captures."""
+    """Add up how far off all lists are at once: what `Assessment` is given."""
     whole = Assessment(
         issue_s, scene, looks, stay_from_s, reference, measured_class, settings=settings, runs=len(lists.start)
     )
-    whole.add(lists, matches, world, truth_at_capture)
+    whole.add(lists, about, now, world)
     return whole.result()
 
 

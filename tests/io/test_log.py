@@ -1,5 +1,6 @@
 """MCAP files as they come: sound, without index, cut off, hit, and files that are none."""
 
+import io
 import random
 from pathlib import Path
 
@@ -120,11 +121,27 @@ def test_nothing_but_the_magic(path):
 def test_file_without_permission_to_read(path, monkeypatch):
     write_recording(path, FRAMES)
 
-    def refuse(self, *_):
+    def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(container, "_File", refuse)
     assert problem(path) == "cannot be opened: Permission denied"
+
+
+class Failing(io.FileIO):
+    """A disk that gives the first hundred bytes and the index, and nothing between them."""
+
+    def readinto(self, buffer):
+        if 100 <= self.tell() < 500:
+            raise OSError(5, "Input/output error")
+        return super().readinto(memoryview(buffer)[:50])
+
+
+def test_a_disk_that_fails_is_no_damage(path, monkeypatch):
+    """It is not taken for a recording that ends early."""
+    write_recording(path, FRAMES)
+    monkeypatch.setattr(container, "_File", type("OnIt", (container._File, Failing), {}))
+    assert problem(path) == "cannot be read: Input/output error"
 
 
 # ------------------------------------------------------------------------------- sound files of every kind

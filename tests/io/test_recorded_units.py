@@ -238,9 +238,11 @@ class TestWhoItIs:
         assert about(path, unit={"delay_s": 0.5}) == [["2"], ["2"]]
         assert about(path) == [[None], [None]]
         result = replayed(path, unit={"delay_s": 0.5})
-        assert row(result, "ideal")["detection_s"] == pytest.approx(0.9)
-        assert not row(result, "union")["detected"]
+        for name in ("ideal", "union"):
+            assert row(result, name)["detection_s"] == pytest.approx(0.9)
         assert figure(result, "ghosts_per_min") == pytest.approx(600), "one in each of 10 lists per s"
+        assert figure(result, "stale_ghosts_per_min") == pytest.approx(600)
+        assert figure(result, "position_rmse_m") == pytest.approx(10.0)
 
     def test_the_receivers_own_body_is_left_out(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(0.4), car(30)))
@@ -356,6 +358,6 @@ def test_a_real_roadside_unit(trial: int, mean_m: float, pairs: int) -> None:
     counted = (np.hypot(tracks.x_m[0, mine], tracks.y_m[0, mine]) < 50) & (captured_m < 1.5)
     assert captured_m[counted].mean() == pytest.approx(mean_m, abs=0.01)
     assert len(mine) == pairs
-    result, matched = replayed(path, **more), arrived_m <= 3.0
+    result, matched = replayed(path, **more), captured_m <= 3.0
     for name, error_m in (("position_rmse_captured_m", captured_m), ("position_rmse_m", arrived_m)):
         assert figure(result, name, "ideal") == pytest.approx(np.sqrt((error_m[matched] ** 2).mean()))

@@ -17,13 +17,26 @@ from copem_replay.core.tracks import CLASSES
 from copem_replay.metrics.accuracy import metrics as accuracy_figures
 from copem_replay.metrics.accuracy.aggregator import Assessment
 from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.metrics.accuracy.nees import expected
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, total
 from copem_replay.metrics.gospa import gospa, ospa
-from copem_replay.metrics.matching import Matches, match
+from copem_replay.metrics.matching import Matches, match, match_both
 from tests.helpers.at_once import assess
 from tests.helpers.reports import between, entry, lists_of, stretches
 from tests.helpers.reports import joined as one_list
-from tests.oracles.accuracy import Places, looks_of, one_run, permuted, plainly, reference_of, scene_of, truth_of
+from tests.oracles.accuracy import (
+    Places,
+    expected_of,
+    looks_of,
+    matches_of,
+    one_run,
+    permuted,
+    plainly,
+    reference_of,
+    scene_of,
+    taken,
+    truth_of,
+)
 
 EGO, CAR, OTHER_CAR = 0, 1, 2
 NOTHING = one_list()
@@ -40,17 +53,18 @@ def assessed(
     velocity: dict[int, tuple[float, float]] | None = None, captures: tuple[Sequence[float], Places] | None = None,
     ego: Sequence[tuple[float, float] | None] | None = None, measured: Sequence[str] = ("car",), **given: Any,
 ) -> Accuracy:  # fmt: skip
-    """Lists at 0, 1, 2 … s around an ego at the origin; captures at the same instants; cut-off 3 m."""
+    """Lists at 0, 1, 2 … s around an ego at the origin, that tell of now or of `captures`; cut-off 3 m."""
     K = len(runs[0])
     times = np.array(range(K) if times_s is None else times_s, dtype=float)
     at_ego = [(0.0, 0.0)] * K if ego is None else list(ego)
     truth = {EGO: at_ego, **places}
     world, scene, lists = truth_of(truth, times.tolist(), velocity), scene_of(*of), lists_of(runs)
-    at_capture = world if captures is None else truth_of(captures[1], captures[0])
-    found = match(lists, world, scene, gate_m=GATE_M)
+    about = now = match(lists, world, scene, gate_m=GATE_M)
+    if captures is not None:
+        about, now = match_both(lists, truth_of(captures[1], captures[0]), world, scene, gate_m=GATE_M)
     return assess(
-        lists, found, times, world, at_capture, scene, looks_of(looks), np.full(len(looks), since_s),
-        reference_of(at_ego), classes(*measured), settings=Settings(**({"cutoff_m": 3.0} | given)),
+        lists, about, now, times, world, scene, looks_of(looks), np.full(len(looks), since_s),
+        reference_of(at_ego), classes(*measured), settings=Settings(**({"cutoff_m": 3.0, "gate_m": GATE_M} | given)),
     )  # fmt: skip
 
 
@@ -89,14 +103,134 @@ def test_latency_is_an_error_now_and_none_at_capture() -> None:
     assert figure("velocity_rmse_mps", of) == pytest.approx(0.0)
 
 
-def test_captures_without_truth_do_not_count() -> None:
+def test_what_tells_of_an_instant_without_truth_is_about_nobody() -> None:
     lists = [entry(10.5, captured_s=t) for t in (0.0, 0.5, 2.0 + 9e-7, 2.5)]
-    captures = ([0.0, 1.0, 2.0], {CAR: [(10.0, 0.0), (10.0, 0.0), (11.5, 0.0)]})
+    captures = ([0.0, 0.5, 2.0, 2.5], {CAR: [(10.0, 0.0), None, (11.5, 0.0), None]})
     of = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)}, captures=captures)
-    assert of.by_object[0, 0]["pairs_captured"] == 2
+    assert of.by_object[0, 0]["pairs"] == 2
     assert figure("position_rmse_captured_m", of) == pytest.approx(math.sqrt((0.5**2 + 1.0**2) / 2))
+    # Now the car is there: its entries are no ghosts, and none of it is missed.
+    assert (of.by_run[0]["ghosts"], of.by_object[0, 0]["missed"]) == (0, 0)
+    assert of.by_existence["with_object"].sum() == 2
     gone = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)}, captures=([0.0], {}))
     assert figure("position_rmse_captured_m", gone) is None
+
+
+def late_by(latency_s: float, speed_mps: float = 12.0, count: int = 5) -> Accuracy:
+    """A car at some speed, each list of it late; a second one stands somewhere else."""
+    times = np.arange(1.0, 1.0 + count)
+    captures = times - latency_s
+    ways = {t: [(speed_mps * t, 20.0) for t in each] for t, each in (("now", times), ("then", captures))}
+    lists = [
+        entry(speed_mps * c, 20.5, captured_s=c, vx_mps=speed_mps, existence=0.8, track_id=k // 3)
+        for k, c in enumerate(captures.tolist())
+    ]
+    return assessed(
+        lists, times_s=times.tolist(), places={CAR: ways["now"]}, velocity={CAR: (speed_mps, 0)},
+        looks={CAR: (0, count)}, captures=(captures.tolist(), {CAR: ways["then"]}),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("latency_s", [0.1, 0.5, 2.0])
+def test_latency_counts_in_full_whatever_the_gate(latency_s: float) -> None:
+    of = late_by(latency_s)
+    assert of.by_object[0, 0]["pairs"] == of.by_object[0, 0]["placed"] == 5
+    assert figure("position_rmse_m", of) == pytest.approx(math.hypot(12 * latency_s, 0.5))
+    assert figure("bias_east_m", of) == pytest.approx(-12 * latency_s)
+    assert figure("velocity_rmse_mps", of) == pytest.approx(0.0)
+    assert figure("age_s", of) == pytest.approx(latency_s)
+    assert figure("identity_switches", of) == 1.0
+    # At the instants the entries tell of.
+    assert figure("position_rmse_captured_m", of) == pytest.approx(0.5)
+    assert figure("nees", of) == pytest.approx(0.25)
+    assert figure("existence_error", of) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("latency_s", "stale_per_min"), [(0.1, 0.0), (0.5, 60.0)])
+def test_what_a_stale_list_is_worth_now(latency_s: float, stale_per_min: float) -> None:
+    of, none = late_by(latency_s), stale_per_min == 0
+    assert figure("ghosts_per_min", of) == figure("stale_ghosts_per_min", of) == pytest.approx(stale_per_min)
+    assert of.by_object[0, 0]["missed"] == (0 if none else 5)
+    assert figure("mtl_s", of) == pytest.approx(1.0 if none else 5.0)
+    assert figure("gospa_missed_m", of) == pytest.approx(0.0 if none else math.sqrt(4.5))
+
+
+def test_ghosts_that_are_about_nobody_then_either_are_not_stale_and_only_these_have_thresholds() -> None:
+    lists = [one_list(entry(10, captured_s=0.0, existence=0.9), entry(50, captured_s=0.0, existence=0.6))] * 2
+    captures = ([0.0], {CAR: [(10.0, 0.0)]})
+    of = assessed(
+        lists, times_s=[1, 2], places={CAR: standing(20, 0, 2)}, looks={CAR: (1, 2)}, captures=captures,
+        existence_thresholds=(0.0, 0.7),
+    )  # fmt: skip
+    assert (of.by_run[0]["ghosts"], of.by_run[0]["stale_ghosts"]) == (4, 2)
+    assert of.ghosts_at.tolist() == [[2, 0]]
+    assert of.by_existence["with_object"][0].tolist() == [0] * 9 + [2]
+
+
+def test_a_pair_whose_object_has_a_gap_now_has_no_error_now() -> None:
+    lists = [entry(10.5, captured_s=0.0, track_id=3)] * 3
+    captures = ([0.0], {CAR: [(10.0, 0.0)]})
+    of = assessed(
+        lists, places={CAR: [(10, 0), None, (12, 0)]}, looks={CAR: (0, 2)}, captures=captures,
+        distance_edges_m=(0.0, 60.0), time_edges_s=(1.0, 2.0),
+    )  # fmt: skip
+    sums = of.by_object[0, 0]
+    assert (sums["pairs"], sums["placed"], sums["tracked"], sums["looked"]) == (3, 2, 3, 2)
+    np.testing.assert_array_equal(of.error_m, [[0.5, np.nan, 1.5]])
+    assert figure("position_rmse_m", of) == pytest.approx(math.sqrt((0.25 + 2.25) / 2))
+    assert figure("bias_east_m", of) == pytest.approx(-0.5)
+    assert figure("velocity_rmse_mps", of) == 0.0
+    assert figure("nees", of) == pytest.approx(0.25)
+    assert figure("age_s", of) == pytest.approx(1.0)
+    assert (of.by_distance[0, 0]["pairs"], of.by_time[0, 0]["pairs"], of.by_time[0, 0]["placed"]) == (2, 1, 0)
+    # Nor can a list hold or miss what is not there.
+    assert sums["missed"] == 0
+
+
+@pytest.mark.parametrize(
+    ("large", "small", "beyond", "expected"),
+    [
+        (1.0, 0.1, 0.00286, 1.9717),
+        (4.0, 0.25, 0.1394, 1.5263),
+        (4.0, 0.01, 0.1338, 1.5506),
+        (1.0, 1.0, math.exp(-4.5), (2 - 11 * math.exp(-4.5)) / (1 - math.exp(-4.5))),
+        (4.0, 4.0, 0.3247, 0.9184),
+        (0.1, 0.05, 0.0, 2.0),
+    ],
+)
+def test_what_the_gate_cuts_off(large: float, small: float, beyond: float, expected: float) -> None:
+    # Turned by 30°.
+    c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
+    cov = (large * c * c + small * s * s, (large - small) * c * s, large * s * s + small * c * c)
+    of = assessed([entry(10, cov=cov)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
+    assert figure("beyond_gate_share", of) == pytest.approx(beyond, abs=5e-5)
+    assert figure("nees_expected", of) == pytest.approx(expected, abs=5e-5)
+
+
+def test_the_gate_cuts_the_mean_and_the_spread_of_true_covariances() -> None:
+    """Errors drawn with the covariance claimed: RMSE 1.92 instead of 2.83 m at v = 4, and NEES where its band says."""
+    rng, variance, count = np.random.default_rng(5), 4.0, 4000
+    runs = [[entry(10 + x, y, cov=(variance, 0, variance))] for x, y in rng.normal(0, math.sqrt(variance), (count, 2))]
+    of = assessed(*runs, places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    assert figure("position_rmse_m", of) == pytest.approx(1.92, abs=0.02)
+    nees = of.by_object["nees"][of.by_object["pairs"] > 0]
+    assert len(nees) / count == pytest.approx(1 - 0.3247, abs=0.02)
+    low, mean, high = (figure(name, of) for name in ("nees_low", "nees_expected", "nees_high"))
+    assert low is not None
+    assert high is not None
+    assert low < nees.mean() < high
+    assert mean == pytest.approx(0.9184, abs=1e-4)
+    # As wide as the mean of as many such samples is uncertain.
+    assert (high - low) / 2 / 1.96 == pytest.approx(nees.std() / math.sqrt(len(nees)), rel=0.03)
+
+
+@settings(max_examples=60)
+@given(st.floats(-9, 4), st.floats(0, 4), st.sampled_from([0.3, 3.0, 50.0]))
+def test_what_is_expected_within_the_gate_as_integrals_have_it(large: float, less: float, gate_m: float) -> None:
+    one, two = 10.0**large, 10.0 ** max(large - less, -9.0)
+    found = expected(one, two, gate_m)
+    wanted = expected_of(entry(0, cov=(one, 0.0, two))[0], gate_m)
+    np.testing.assert_allclose(found, wanted, rtol=2e-6, atol=2e-9)
 
 
 def test_velocity_error_is_the_length_of_the_difference() -> None:
@@ -143,7 +277,7 @@ def test_nees(cov: tuple[float, float, float], error: tuple[float, float], expec
 def test_nees_band_is_of_as_many_samples_as_rows_with_a_match() -> None:
     def of_rows(n: int) -> Accuracy:
         matched, missed = [entry(10), entry(10)], [NOTHING, NOTHING]
-        return assessed(*[matched] * n, missed, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
+        return assessed(*[matched] * n, missed, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)}, gate_m=100.0)
 
     hundred, more = of_rows(100), of_rows(500)
     band = [figure("nees_low", hundred), figure("nees_high", hundred)]
@@ -404,11 +538,20 @@ class Scenery:
         self.lists = lists_of([[self._list(rng, k, way) for k in range(K)] for _ in range(S)])
         self.world = truth_of(self.places, self.times.tolist(), self.velocity)
         self.settings = Settings(
-            cutoff_m=2.5, power=float(rng.choice([1.0, 2.0, 3.0])), distance_edges_m=(0.0, 3.0, 6.0, np.inf),
-            time_edges_s=(0.2, 1.0, 1.5), existence_thresholds=(0.25, 0.5, 0.9),
+            cutoff_m=2.5, gate_m=2.0, power=float(rng.choice([1.0, 2.0, 3.0])),
+            distance_edges_m=(0.0, 3.0, 6.0, np.inf), time_edges_s=(0.2, 1.0, 1.5),
+            existence_thresholds=(0.25, 0.5, 0.9),
         )  # fmt: skip
-        self.found = match(self.lists, self.world, self.scene, gate_m=2.0)
+        self.captured = truth_of(self.places_captured, self.captures)
+        self.tells_of_now = bool(rng.uniform() < 0.3)
+        self.found = self.matched(self.lists)
         self.rng = rng
+
+    def matched(self, lists: Lists) -> tuple[Matches, Matches]:
+        if self.tells_of_now:
+            found = match(lists, self.world, self.scene, gate_m=2.0)
+            return found, found
+        return match_both(lists, self.captured, self.world, self.scene, gate_m=2.0)
 
     def _list(self, rng: np.random.Generator, k: int, way: Any) -> Entries:
         found = [place for o in self.places if (place := self.places[o][k]) is not None and rng.uniform() < 0.8]
@@ -429,30 +572,23 @@ class Scenery:
             )  # fmt: skip
         return one_list(*entries)
 
-    def of(self, lists: Lists, found: Matches) -> Accuracy:
-        at_capture = truth_of(self.places_captured, self.captures)
+    def of(self, lists: Lists, found: tuple[Matches, Matches]) -> Accuracy:
         return assess(
-            lists, found, self.times, self.world, at_capture, self.scene, self.looks, self.since_s, self.reference,
+            lists, *found, self.times, self.world, self.scene, self.looks, self.since_s, self.reference,
             self.measured, settings=self.settings,
         )  # fmt: skip
 
     def in_stretches(self, cuts: Sequence[float]) -> Accuracy:
-        """The same, fed with the lists between cuts, their instants, and the captures their entries name."""
+        """The same, fed with the lists between cuts, their matches, and their instants."""
         adding = Assessment(
             self.times, self.scene, self.looks, self.since_s, self.reference, self.measured, settings=self.settings,
             runs=len(self.lists.start),
         )  # fmt: skip
         for a, b in stretches(cuts, len(self.times)):
             lists, rows = between(self.lists, a, b)
-            named_s = lists.entries["captured_s"]
-            near = [f for f, t in enumerate(self.captures) if (abs(named_s - t) <= 2e-6).any()]
             adding.add(
-                lists, Matches(self.found.object_ix[rows], self.found.role[rows]),
+                lists, *(taken(one, rows) for one in self.found),
                 truth_of({o: way[a:b] for o, way in self.places.items()}, self.times[a:b].tolist(), self.velocity),
-                truth_of(
-                    {o: [way[f] for f in near] for o, way in self.places_captured.items()},
-                    [self.captures[f] for f in near],
-                ),
             )  # fmt: skip
         return adding.result()
 
@@ -481,7 +617,8 @@ def test_sums_as_the_sentences_have_them(seed: int) -> None:
     made = Scenery(seed)
     found = made.of(made.lists, made.found)
     expected = plainly(
-        made.lists, made.found, made.times, made.places, made.velocity, made.captures, made.places_captured,
+        made.lists, *made.found, made.times, made.places, made.velocity,
+        None if made.tells_of_now else made.captures, made.places_captured,
         made.looks, made.since_s, made.reference, made.measured, made.settings,
     )  # fmt: skip
     assert_same(found, expected, exactly=False)
@@ -495,11 +632,11 @@ def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_m
     parts = []
     for s in range(len(made.lists.start)):
         lists, its = one_run(made.lists, s)
-        parts.append(made.of(lists, Matches(made.found.object_ix[its], made.found.role[its])))
+        parts.append(made.of(lists, (taken(made.found[0], its), taken(made.found[1], its))))
         assert_same(parts[s], whole.of_run(s))
     assert_equal_totals(total(parts), total([whole]))
     shuffled, _, _ = permuted(made.lists, None, made.rng)
-    assert_same(made.of(shuffled, match(shuffled, made.world, made.scene, gate_m=2.0)), whole, exactly=False)
+    assert_same(made.of(shuffled, made.matched(shuffled)), whole, exactly=False)
 
 
 @settings(max_examples=60)
@@ -517,7 +654,8 @@ def test_what_is_known_and_as_which_track_goes_on_over_a_cut() -> None:
     made.scene, made.looks, made.since_s = scene_of("car", "car"), looks_of({CAR: (0, 3)}), np.zeros(1)
     made.reference = reference_of(standing(0, 0, 4))
     made.world = truth_of(made.places, made.times.tolist())
-    made.found = match(made.lists, made.world, made.scene, gate_m=2.0)
+    made.tells_of_now = True
+    made.found = made.matched(made.lists)
     sums = made.in_stretches([0.5]).by_object[0, 0]
     assert (sums["switches"], sums["mtl_s"]) == (1, 2.0)
 
@@ -529,13 +667,13 @@ def test_lists_too_many_or_too_few_are_a_defect() -> None:
         np.arange(2.0), made.scene, made.looks, made.since_s, reference_of([None, None]), made.measured,
         settings=made.settings, runs=1,
     )  # fmt: skip
-    no_matches = Matches(np.empty(0, dtype=int), np.empty(0, dtype=np.int8))
+    no_matches = matches_of([], [])
     with pytest.raises(ValueError, match="expected 2 lists, found 0"):
         adding.result()
     with pytest.raises(ValueError, match="expected lists of 1 runs, at most 2 of each; found 1 runs of 3"):
-        adding.add(lists_of([[NOTHING] * 3]), no_matches, none, none)
+        adding.add(lists_of([[NOTHING] * 3]), no_matches, no_matches, none)
     with pytest.raises(ValueError, match="found 2 runs of 1"):
-        adding.add(lists_of([[NOTHING]] * 2), no_matches, none, none)
+        adding.add(lists_of([[NOTHING]] * 2), no_matches, no_matches, none)
 
 
 @pytest.mark.parametrize("cut", [1, 7, 199])

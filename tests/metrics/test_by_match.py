@@ -18,7 +18,7 @@ from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 from tests.helpers.at_once import first_matches
 from tests.helpers.reports import between, entry, joined, lists_of, stretches
 from tests.metrics.test_by_truth_id import Unit, World, holds, tracks
-from tests.oracles.accuracy import looks_of, one_run, permuted
+from tests.oracles.accuracy import looks_of, matches_of, one_run, permuted, taken
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,7 @@ def listed(runs: Sequence[Sequence[Sequence[Item]]]) -> tuple[Lists, Matches]:
         ]
     )
     flat = [e for run in runs for one in run for e in one]
-    return lists, Matches(
-        np.array([e.object_ix for e in flat], dtype=int), np.array([e.role for e in flat], dtype=np.int8)
-    )
+    return lists, matches_of([e.object_ix for e in flat], [e.role for e in flat])
 
 
 def of_one_unit(captured_s: Sequence[float]) -> Captures:
@@ -323,7 +321,7 @@ def test_as_the_sentences_have_it(
             assert (np.diff(steps.existence[mine]) > 0).all()
             assert (np.diff(steps.detection_s[mine]) > 0).all()
         alone, its = one_run(lists, s)
-        by_itself, _ = detect(alone, Matches(matches.object_ix[its], matches.role[its]))
+        by_itself, _ = detect(alone, taken(matches, its))
         np.testing.assert_array_equal(by_itself.detection_s[0], detections.detection_s[s])
     assert (np.diff(steps.run_ix * len(objects) + steps.look_ix) >= 0).all()
     shuffled, moved, _ = permuted(lists, matches, np.random.default_rng(seed))
@@ -337,7 +335,7 @@ def test_as_the_sentences_have_it(
     )  # fmt: skip
     for a, b in stretches(cuts, 9):
         some, rows = between(lists, a, b)
-        adding.add(some, Matches(matches.object_ix[rows], matches.role[rows]), issue_s[a:b])
+        adding.add(some, taken(matches, rows), issue_s[a:b])
     for whole, parts in zip((detections, steps), adding.result(), strict=True):
         for name, column in vars(whole).items():
             np.testing.assert_array_equal(getattr(parts, name), column)
@@ -354,7 +352,7 @@ def test_what_confirms_may_lie_on_both_sides_of_a_cut(cut: int) -> None:
     )  # fmt: skip
     for a, b in ((0, cut), (cut, 4)):
         some, rows = between(lists, a, b)
-        adding.add(some, Matches(matches.object_ix[rows], matches.role[rows]), issue_s[a:b])
+        adding.add(some, taken(matches, rows), issue_s[a:b])
     _, steps = adding.result()
     assert steps.existence.tolist() == [0.4, 0.6]
     assert steps.detection_s.tolist() == [2.0, 3.0]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
+from scipy.special import gammainc
 
 from copem_replay.core.object_list import Lists
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
@@ -110,12 +111,23 @@ def nees_of(entry: Any, error: Array) -> float:
     return float(sum((error @ direction[:, q]) ** 2 / max(size[q], 1e-9) for q in (0, 1)))
 
 
+def expected_of(entry: Any, gate_m: float) -> tuple[float, float, float]:
+    """Share beyond the gate, mean and mean square of NEES of what is within, by integrals over 64 directions."""
+    covariance = np.array([[entry["cov_ee_m2"], entry["cov_en_m2"]], [entry["cov_en_m2"], entry["cov_nn_m2"]]])
+    small, large = np.maximum(np.linalg.eigvalsh(covariance), 1e-9)
+    angle = (np.arange(64) + 0.5) * 2 * np.pi / 64
+    limit = gate_m**2 / (large * np.cos(angle) ** 2 + small * np.sin(angle) ** 2)
+    # χ² of two degrees of freedom is the gamma distribution of shape 1 and scale 2.
+    below, first, second = (np.mean(gammainc(k, limit / 2)) for k in (1, 2, 3))
+    return 1 - below, 2 * first / below, 8 * second / below
+
+
 def plainly(
-    lists: Lists, matches: Matches, issue_s: Array, places: Places, velocity: Mapping[int, tuple[float, float]],
-    captures_s: Sequence[float], places_captured: Places, looks: Looks, stay_from_s: Array,
-    reference: Reference, measured: Array, settings: Settings,
+    lists: Lists, about: Matches, now: Matches, issue_s: Array, places: Places,
+    velocity: Mapping[int, tuple[float, float]], captures_s: Sequence[float] | None, places_captured: Places,
+    looks: Looks, stay_from_s: Array, reference: Reference, measured: Array, settings: Settings,
 ) -> Accuracy:  # fmt: skip
-    """The same as `assess`, by the sentences of its module."""
+    """The same as `assess`, by the sentences of its module. `captures_s`: None, entries tell of now."""
     S, K, M = len(lists.start), len(issue_s), len(looks.object_ix)
     edges = {"by_distance": settings.distance_edges_m, "by_time": settings.time_edges_s}
     window = [
@@ -157,42 +169,60 @@ def plainly(
                 assert place is not None
                 mine: list[Any] = []
                 for i in range(lists.start[s, k], lists.start[s, k + 1]):
-                    if matches.object_ix[i] == o and matches.role[i] == MATCH:
+                    if now.object_ix[i] == o and now.role[i] == MATCH:
                         mine.append(lists.entries[i])
-                    if matches.object_ix[i] == o and matches.role[i] == DUPLICATE:
+                    if now.object_ix[i] == o and now.role[i] == DUPLICATE:
                         by_object[s, m]["duplicates"] += issue_s[k] >= looks.onset_s[m] - SAME_S
                 assert len(mine) <= 1
                 known.append((float(issue_s[k]), bool(mine)))
-                sums = [by_object[s, m : m + 1], *bands(s, k, place)]
                 if issue_s[k] >= looks.onset_s[m] - SAME_S:
-                    for one in sums:
+                    for one in [by_object[s, m : m + 1], *bands(s, k, place)]:
                         one["looked"] += 1
                         one["missed"] += not mine
-                if not mine:
+            for k in [k for k in window[m] if k in present]:  # gaps of the truth are no matter here
+                those = range(lists.start[s, k], lists.start[s, k + 1])
+                paired = [lists.entries[i] for i in those if about.object_ix[i] == o and about.role[i] == MATCH]
+                assert len(paired) <= 1
+                if not paired:
                     continue
-                (entry,) = mine
+                (entry,) = paired
+                if captures_s is None:
+                    then = places[o][k]
+                else:
+                    f = min(range(len(captures_s)), key=lambda f: abs(captures_s[f] - entry["captured_s"]))
+                    assert abs(captures_s[f] - entry["captured_s"]) <= SAME_S
+                    then = places_captured[o][f]
+                assert then is not None, "nobody is there in a gap of the truth"
+                off = np.array([entry["x_m"], entry["y_m"]]) - then
+                assert np.hypot(*off) <= settings.gate_m + 1e-6
+                by_object[s, m]["square_then_m2"] += off @ off
+                by_object[s, m]["age_s"] += issue_s[k] - entry["captured_s"]
+                beyond, mean, square = expected_of(entry, settings.gate_m)
+                by_object[s, m]["beyond_gate"] += beyond
+                by_object[s, m]["nees_square_expected"] += square
+                place = at(o, k)
+                sums = [by_object[s, m : m + 1]]
+                if place is not None:
+                    sums += bands(s, k, place)
+                elif (d := band_of(edges["by_time"], float(issue_s[k]))) is not None:
+                    sums.append(banded["by_time"][s, d : d + 1])
+                for one in sums:
+                    one["pairs"] += 1
+                    one["nees"] += nees_of(entry, off)
+                    one["nees_expected"] += mean
+                if entry["track_id"] >= 0:
+                    tracks.append(int(entry["track_id"]))
+                if place is None:
+                    continue
                 error = np.array([entry["x_m"], entry["y_m"]]) - place
                 error_m[s, column[m, k]] = np.hypot(*error)
                 for one in sums:
-                    one["pairs"] += 1
+                    one["placed"] += 1
                     one["square_m2"] += error @ error
                     one["east_m"] += error[0]
                     one["north_m"] += error[1]
-                    one["nees"] += nees_of(entry, error)
                 speed = np.array([entry["vx_mps"], entry["vy_mps"]]) - np.array(velocity.get(o, (0.0, 0.0)))
                 by_object[s, m]["velocity_square_m2ps2"] += speed @ speed
-                by_object[s, m]["age_s"] += issue_s[k] - entry["captured_s"]
-                nearest = min(
-                    range(len(captures_s)), key=lambda f: abs(captures_s[f] - entry["captured_s"]), default=-1
-                )
-                if nearest >= 0 and abs(captures_s[nearest] - entry["captured_s"]) <= SAME_S:
-                    then = places_captured[o][nearest] if o in places_captured else None
-                    if then is not None:
-                        by_object[s, m]["pairs_captured"] += 1
-                        by_object[s, m]["square_captured_m2"] += (entry["x_m"] - then[0]) ** 2
-                        by_object[s, m]["square_captured_m2"] += (entry["y_m"] - then[1]) ** 2
-                if entry["track_id"] >= 0:
-                    tracks.append(int(entry["track_id"]))
             by_object[s, m]["tracked"] = len(tracks)
             by_object[s, m]["switches"] = sum(a != b for a, b in pairwise(tracks))
             by_object[s, m]["mtl_s"] = longest_unknown(known, looks.onset_s[m], looks.ended_s[m])
@@ -206,7 +236,7 @@ def plainly(
             ]
             believed = []
             for i in range(lists.start[s, k], lists.start[s, k + 1]):
-                entry, role, o = lists.entries[i], matches.role[i], matches.object_ix[i]
+                entry, role, o = lists.entries[i], now.role[i], now.object_ix[i]
                 place = np.array([entry["x_m"], entry["y_m"]])
                 by_run[s]["duplicates"] += role == DUPLICATE and o in looks.object_ix
                 is_measured = bool(measured[likely(entry)])
@@ -214,10 +244,13 @@ def plainly(
                     claim = by_existence[s, min(int(entry["existence"] * 10), 9)]
                     claim["entries"] += 1
                     claim["existence"] += entry["existence"]
-                    claim["with_object"] += role != GHOST
+                    claim["with_object"] += about.role[i] != GHOST
                 if role == GHOST and is_measured:
                     by_run[s]["ghosts"] += 1
-                    ghosts_at[s] += entry["existence"] >= np.array(settings.existence_thresholds)
+                    if about.role[i] != GHOST:
+                        by_run[s]["stale_ghosts"] += 1
+                    else:
+                        ghosts_at[s] += entry["existence"] >= np.array(settings.existence_thresholds)
                     for one in bands(s, k, place):
                         one["ghosts"] += 1
                     h = nearest_of(here, place)
@@ -281,8 +314,19 @@ def permuted(lists: Lists, matches: Matches | None, rng: np.random.Generator) ->
     for start in lists.start:
         for a, b in pairwise(start):
             to[a:b] = a + rng.permutation(b - a)
-    moved = None if matches is None else Matches(matches.object_ix[to], matches.role[to])
+    moved = None if matches is None else taken(matches, to)
     return Lists(lists.start, lists.entries[to]), moved, to
+
+
+def matches_of(object_ix: Sequence[int], role: Sequence[int]) -> Matches:
+    """Objects and roles as given, places that mean nothing."""
+    nowhere, nothing = np.full(len(role), np.nan), np.zeros(len(role), dtype=np.int8)
+    return Matches(np.array(object_ix, dtype=int), np.array(role, dtype=np.int8), nowhere, nowhere, nothing)
+
+
+def taken(matches: Matches, rows: Any) -> Matches:
+    """Those of some entries."""
+    return Matches(*(column[rows] for column in vars(matches).values()))
 
 
 def one_run(lists: Lists, run: int) -> tuple[Lists, slice]:

@@ -108,7 +108,7 @@ class TestNumbers:
                         assert (cell.low or "") == rows[name][f"{column}_low"]
                         assert (cell.high or "") == rows[name][f"{column}_high"]
                     checked += 1
-        assert checked == len(NAMES) * (8 + 2 + 9)
+        assert checked == len(NAMES) * (8 + 2 + 11)
 
     def test_cells_read_as_in_the_terminal(self, read: Page, made: Path) -> None:
         summary = load_results(made).summary.astype({"list_rate_hz": float})

@@ -224,7 +224,7 @@ def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
 
 # -------------------------------------------------------------------------------------- at equal ghosts
 
-LISTS = [ghosts("ideal", 0), ghosts("late", 6, existence=[0.0, 0.5, 0.9], ghosts_at=[6, 2, 0])]
+LISTS = [ghosts("ideal", 0), ghosts("late", 60, existence=[0.0, 0.5, 0.9], ghosts_at=[60, 20, 0])]
 STEPS = [step("ideal", 1.0, 0.5), step("late", 0.4, 1.0), step("late", 0.7, 3.0)]
 
 
@@ -236,12 +236,16 @@ def at_equal_ghosts(path: Path, per_min: float | None, *, lists: Sequence[Row] =
 @pytest.mark.parametrize(
     ("per_min", "existence", "time_s", "kept"),
     [
-        (6, 0.0, 1.0, 6),
-        (9, 0.0, 1.0, 6),  # there are no more
-        (5, 0.0, 0.75 * 1.0 + 0.25 * 3.0, 5),  # (5 − 2) / (6 − 2) of the drives with 6 a minute, the rest with 2
-        (2, 0.5, 3.0, 2),
-        (0.5, 0.5, 0.25 * 3.0 + 0.75 * 10.0, 0.5),
-        (0, 0.9, 10.0, 0),
+        (60, 0.0, 1.0, 60),
+        (90, 0.0, 1.0, 60),  # there are no more
+        (
+            50,
+            0.0,
+            0.75 * 1.0 + 0.25 * 3.0,
+            50,
+        ),  # (50 − 20) / (60 − 20) of the drives with 60 a minute, the rest with 20
+        (20, 0.5, 3.0, 20),
+        (10, 0.5, 0.5 * 3.0 + 0.5 * 10.0, 10),
     ],
 )
 def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_s, kept):
@@ -253,51 +257,97 @@ def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_
     assert (time["value"], time["baseline_value"], time["difference"]) == (time_s, 0.5, time_s - 0.5)
     said = [note for note in comparison.notes if "ghosts per minute only" in note]
     assert [note for note in said if note.startswith("late")] == (
-        ["late: all its entries make 6 ghosts per minute only: its ttd_rmst_s_equal_ghosts is at that"]
+        ["late: all its entries make 60 ghosts per minute only: its ttd_rmst_s_equal_ghosts is at that"]
         if kept < per_min
         else []
     )
 
 
 def test_the_rate_is_the_baselines_own_unless_given(tmp_path):
-    comparison = at_equal_ghosts(tmp_path, None)
-    assert comparison.ghosts_per_min == 0.0
-    assert of(comparison, "ttd_rmst_s_equal_ghosts")["existence"] == 0.9
+    lists = [ghosts("ideal", 20, existence=[0.0, 0.5, 0.9], ghosts_at=[20, 0, 0]), LISTS[1]]
+    comparison = at_equal_ghosts(tmp_path, None, lists=lists)
+    assert comparison.ghosts_per_min == 20.0
+    assert of(comparison, "ttd_rmst_s_equal_ghosts")["existence"] == 0.5
     back = compare([tmp_path / "study"], baseline="late")
-    assert back.ghosts_per_min == 6.0
+    assert back.ghosts_per_min == 60.0
     assert of(back, "ttd_rmst_s_equal_ghosts")["difference"] == -0.5
 
 
 def test_an_entry_at_the_threshold_is_not_left_out(tmp_path):
-    lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.7], ghosts_at=[6, 2])]
-    assert of(at_equal_ghosts(tmp_path, 2, lists=lists), "ttd_rmst_s_equal_ghosts")["value"] == 3.0
+    lists = [LISTS[0], ghosts("late", 60, existence=[0.0, 0.7], ghosts_at=[60, 20])]
+    assert of(at_equal_ghosts(tmp_path, 20, lists=lists), "ttd_rmst_s_equal_ghosts")["value"] == 3.0
 
 
 def test_who_is_no_longer_detected_is_censored_as_in_any_other_mean(tmp_path):
     still = {"ended_by": "log_end", "ended_s": 7.0}
-    assert of(at_equal_ghosts(tmp_path, 0, **still), "ttd_rmst_s_equal_ghosts")["value"] == 10.0
+    lists = [LISTS[0], ghosts("late", 60, existence=[0.0, 0.8], ghosts_at=[60, 20])]
+    assert of(at_equal_ghosts(tmp_path, 20, lists=lists, **still), "ttd_rmst_s_equal_ghosts")["value"] == 10.0
 
 
 def test_where_no_threshold_is_clean_enough_nothing_is_listed_in_some_drives(tmp_path):
-    lists = [LISTS[0], ghosts("late", 6, existence=[0.0, 0.5], ghosts_at=[6, 2])]
-    time = of(at_equal_ghosts(tmp_path, 1, lists=lists), "ttd_rmst_s_equal_ghosts")
-    assert (time["existence"], time["ghosts_kept_per_min"]) == (0.5, 1)
-    assert time["value"] == 0.5 * 3.0 + 0.5 * 10.0  # half of the drives at 2 a minute, in half of them nothing
+    lists = [LISTS[0], ghosts("late", 60, existence=[0.0, 0.5], ghosts_at=[60, 20])]
+    time = of(at_equal_ghosts(tmp_path, 10, lists=lists), "ttd_rmst_s_equal_ghosts")
+    assert (time["existence"], time["ghosts_kept_per_min"]) == (0.5, 10)
+    assert time["value"] == 0.5 * 3.0 + 0.5 * 10.0  # half of the drives at 20 a minute, in half of them nothing
+
+
+NONE = "no ttd_rmst_s_equal_ghosts: "
+SURE = [step("ideal", 1.0, 0.5), step("late", 0.9, 3.0)]
+
+
+@pytest.mark.parametrize(
+    ("per_min", "lists", "steps", "why"),
+    [
+        (0, LISTS, STEPS, f"late: {NONE}fewer than 10 ghosts would decide"),
+        (9.9, LISTS, STEPS, f"late: {NONE}fewer than 10 ghosts would decide"),
+        (None, [ghosts("ideal", 9), LISTS[1]], STEPS, f"late: {NONE}fewer than 10 ghosts would decide"),
+        (
+            20,
+            [ghosts("ideal", 0), ghosts("late", 60, existence=[0.0, 0.89, 0.91], ghosts_at=[60, 60, 0])],
+            SURE,
+            f"late: {NONE}all its entries claim the same existence, so that none is left out before the others",
+        ),
+        (
+            20,
+            [ghosts("ideal", 60, existence=[0.0, 1.0], ghosts_at=[60, 60]), ghosts("late", 20)],
+            SURE,
+            f"late: {NONE}of the baseline all its entries claim the same existence, so that none is left out before "
+            "the others",
+        ),
+    ],
+)
+def test_where_equal_ghosts_say_nothing_there_is_none(tmp_path, per_min, lists, steps, why):
+    rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0)]
+    comparison = compared(tmp_path, rows, lists=lists, steps=steps, ghosts_per_min=per_min)
+    assert why in comparison.notes
+    assert "ttd_rmst_s_equal_ghosts" not in set(comparison.table["metric"])
+    assert "ghosts_per_min" in set(comparison.table["metric"])
+
+
+def test_of_the_truth_nothing_is_at_equal_ghosts(tmp_path):
+    rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0)]
+    folder = write_folder(tmp_path / "study", rows, lists=LISTS, steps=STEPS)
+    (folder / "experiment.yaml").write_text(
+        "version: 1\nconfigurations:\n  ideal: {units: truth}\n  late: {units: all}\n"
+    )
+    comparison = compare([folder], ghosts_per_min=20)
+    assert f"late: {NONE}the baseline is the truth, which has no ghosts" in comparison.notes
+    assert "ttd_rmst_s_equal_ghosts" not in set(comparison.table["metric"])
 
 
 def test_the_threshold_is_that_of_all_logs_in_each_of_them(tmp_path):
     rows = [row(name, 1.0, 30.0, log=log) for name in ("ideal", "late") for log in ("a", "b")]
     steps = [step(name, 1.0, 1.0, log=log) for name in ("ideal", "late") for log in ("a", "b")]
-    lists = [ghosts("ideal", 2, log=log) for log in ("a", "b")]
+    lists = [ghosts("ideal", 20, log=log) for log in ("a", "b")]
     lists += [
         ghosts("late", n, log=log, existence=[0.0, 0.5, 0.8], ghosts_at=[n, at, 0])
-        for log, n, at in (("a", 9, 4), ("b", 1, 0))
+        for log, n, at in (("a", 90, 40), ("b", 10, 0))
     ]
     table = compared(tmp_path, rows, lists=lists, steps=steps).table
     times = table[table["metric"] == "ttd_rmst_s_equal_ghosts"]
-    # 2 a minute of both logs: 4 of `a` and none of `b`, though one log alone has more and the other fewer.
+    # 20 a minute of both logs: 40 of `a` and none of `b`, though one log alone has more and the other fewer.
     assert times["existence"].tolist() == [0.5, 0.5, 0.5]
-    assert times["ghosts_kept_per_min"].tolist() == [2.0, 2.0, 2.0]
+    assert times["ghosts_kept_per_min"].tolist() == [20.0, 20.0, 20.0]
 
 
 def test_the_same_folder_again_differs_in_nothing(tmp_path):

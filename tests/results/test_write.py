@@ -48,6 +48,7 @@ COLUMNS = {
 }
 ACCURACY = {
     "matched_lists": pa.int64(),
+    "unplaced_lists": pa.int64(),
     "position_rmse_m": pa.float64(),
     "position_rmse_captured_m": pa.float64(),
     "bias_east_m": pa.float64(),
@@ -67,7 +68,8 @@ SUMMARY = [
 FIGURES = [
     "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps", "age_s",
     "gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m", "ospa_m", "ghosts_per_min",
-    "duplicates_per_min", "nees", "nees_low", "nees_high", "existence_error", "identity_switches", "mtl_s",
+    "stale_ghosts_per_min", "duplicates_per_min", "nees", "nees_expected", "nees_low", "nees_high", "beyond_gate_share",
+    "existence_error", "identity_switches", "mtl_s",
 ]  # fmt: skip
 TABLES = {"accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet", "bands.csv"}
 

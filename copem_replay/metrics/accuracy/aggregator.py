@@ -6,7 +6,7 @@ import numpy as np
 
 from copem_replay.core.object_list import Lists
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Scene, Tracks
-from copem_replay.metrics.accuracy.kernel import Asked, SoFar, Stays, Sums, World, add_up, close
+from copem_replay.metrics.accuracy.kernel import Asked, Found, SoFar, Stays, Sums, World, add_up, close
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, EXISTENCE_BINS, OBJECT, RUN, Accuracy, Settings
 from copem_replay.metrics.episodes import Looks, Reference
 from copem_replay.metrics.matching import Matches
@@ -44,8 +44,9 @@ class Assessment:
         distance_edges_m, time_edges_s = _column(settings.distance_edges_m), _column(settings.time_edges_s)
         thresholds = _column(settings.existence_thresholds)
         self._asked = Asked(
-            settings.cutoff_m, settings.power, measured_class, distance_edges_m, time_edges_s, thresholds
-        )
+            settings.cutoff_m, settings.power, settings.gate_m, measured_class, distance_edges_m, time_edges_s,
+            thresholds,
+        )  # fmt: skip
         S, M, L = runs, len(looks.object_ix), int(count.sum())
         self._out = Sums(
             np.full((S, L), np.nan, dtype=np.float32),
@@ -62,11 +63,11 @@ class Assessment:
         self._so_far = SoFar(np.full((S, M), -1), np.tile(looks.onset_s, (S, 1)))
         self._added = 0
 
-    def add(self, lists: Lists, matches: Matches, world: Tracks, truth_at_capture: Tracks) -> None:
+    def add(self, lists: Lists, about: Matches, now: Matches, world: Tracks) -> None:
         """Add the lists that come next.
 
-        `world`: the truth when they are available, frame k at the instant of the k-th of them. `truth_at_capture`: the
-        truth at captures, frames ascending: at all that are within 2 µs of any that these entries name, at least.
+        `about`: matches at the instants the entries tell of, `now`: at those the lists are available. `world`: the
+        truth at these, frame k at the instant of the k-th list.
         """
         runs, count = len(lists.start), lists.start.shape[1] - 1
         left = len(self._issue_s) - self._added
@@ -76,8 +77,8 @@ class Assessment:
         these = slice(self._added, self._added + count)
         at = self._reference
         add_up(
-            lists.start, lists.entries, matches.object_ix, matches.role, self._issue_s[these], _by_list(world),
-            _by_list(truth_at_capture), self._stays._replace(first_list=self._stays.first_list - self._added),
+            lists.start, lists.entries, _found(about), _found(now), self._issue_s[these], _by_list(world),
+            self._stays._replace(first_list=self._stays.first_list - self._added),
             at.x_m[these], at.y_m[these], at.present[these], self._asked, self._so_far, self._out,
         )  # fmt: skip
         self._added += count
@@ -94,10 +95,14 @@ def _column(values: tuple[float, ...]) -> Float:
     return np.array(values, dtype=np.float64)
 
 
+def _found(matches: Matches) -> Found:
+    return Found(matches.object_ix, matches.role, matches.x_m, matches.y_m, matches.class_ix)
+
+
 def _by_list(truth: Tracks) -> World:
     order = np.lexsort((truth.row_object_ix, truth.frame_ix))
     columns = (getattr(truth, name)[0, order] for name in ("x_m", "y_m", "vx_mps", "vy_mps"))
-    return World(truth.captured_s, truth.by_frame[1], truth.row_object_ix[order], *columns)
+    return World(truth.by_frame[1], truth.row_object_ix[order], *columns)
 
 
 def _time_s(issue_s: Float, present: Bool) -> float:

@@ -10,26 +10,33 @@ from numpy.typing import NDArray
 
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
+from copem_replay.metrics.accuracy.nees import expected, nees
 from copem_replay.metrics.gospa import gospa_pairs
-from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, most_probable
-
-SMALLEST_VARIANCE_M2 = 1e-9
-"""Eigenvalues of a covariance count as at least this (the contract's)."""
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 Records = NDArray[Any]
 
 
 class World(NamedTuple):
-    """The truth list by list, in each by object: frame f is rows `start[f] : start[f + 1]`."""
+    """The truth list by list, in each by object: that of list k is rows `start[k] : start[k + 1]`."""
 
-    captured_s: Float  # (F,) ascending
-    start: Int  # (F + 1,)
+    start: Int  # (K + 1,)
     object_ix: Int  # (P,), as all that follow
     x_m: Float
     y_m: Float
     vx_mps: Float
     vy_mps: Float
+
+
+class Found(NamedTuple):
+    """What entries are matched with. All (N,)."""
+
+    object_ix: Int
+    role: NDArray[np.int8]
+    x_m: Float  # where it is then
+    y_m: Float
+    class_ix: NDArray[np.int8]  # what entries say themselves
 
 
 class Stays(NamedTuple):
@@ -48,6 +55,7 @@ class Asked(NamedTuple):
 
     cutoff_m: float
     power: float
+    gate_m: float
     measured_class: Bool  # (C,)
     distance_edges_m: Float
     time_edges_s: Float
@@ -77,9 +85,10 @@ class SoFar(NamedTuple):
 class _Here(NamedTuple):
     # The objects whose stay has the list at hand, and their matches in the run at hand.
     look: Int
-    row: Int  # of the truth
+    row: Int  # of the truth, −1: it has a gap there
     distance_band: Int
-    match: Int  # −1: none
+    pair: Int  # the entry that is about it, −1: none
+    match: Int  # the one that is matched with it now, −1: none
     target: Int  # its place among the targets, −1: not looked at now
     place_of: Int  # by look: its place here, −1: not here
 
@@ -102,11 +111,13 @@ class _Believed(NamedTuple):
 
 @nb.njit(cache=True, nogil=True)
 def add_up(
-    start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, world: World,
-    at_capture: World, stays: Stays, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: Asked,
-    so_far: SoFar, out: Sums,
+    start: Int, entries: Entries, about: Found, now: Found, issue_s: Float, world: World, stays: Stays,
+    reference_x_m: Float, reference_y_m: Float, present: Bool, asked: Asked, so_far: SoFar, out: Sums,
 ) -> None:  # fmt: skip
-    """Add the next K lists of S runs. Numbers of lists in `stays` count from the first of them."""
+    """Add the next K lists of S runs. Numbers of lists in `stays` count from the first of them.
+
+    `about`: matches at the instants the entries tell of; `now`: at those the lists are available.
+    """
     S, M = out.by_object.shape
     longest = 0
     for s in range(S):
@@ -114,7 +125,7 @@ def add_up(
             longest = max(longest, start[s, k + 1] - start[s, k])
     here = _Here(
         np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M, np.int64),
-        np.empty(M, np.int64), np.full(M, -1),
+        np.empty(M, np.int64), np.empty(M, np.int64), np.full(M, -1),
     )  # fmt: skip
     targets = _Targets(
         np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64), np.empty(M, np.int64)
@@ -128,30 +139,40 @@ def add_up(
         time_band = _band(asked.time_edges_s, issue_s[k])
         column = stays.column + (k - stays.first_list)
         for s in range(S):
+            here.pair[:n] = -1
             here.match[:n] = -1
             count = _entries(
-                s, start[s, k], start[s, k + 1], entries, object_ix, role, stays, from_m, time_band, asked,
+                s, start[s, k], start[s, k + 1], entries, about, now, stays, from_m, time_band, asked,
                 here, targets, looked_at, believed, out,
             )  # fmt: skip
             for h in range(n):
-                m, i = here.look[h], here.match[h]
+                m, match = here.look[h], here.match[h]
                 if here.target[h] >= 0:
-                    _look(out.by_object[s], m, i)
-                    _look(out.by_distance[s], here.distance_band[h], i)
-                    _look(out.by_time[s], time_band, i)
-                _follow(
-                    out.by_object[s, m], m, entries, i, issue_s[k], stays, so_far.unknown_since_s[s],
-                    so_far.last_track[s],
-                )  # fmt: skip
-                if i >= 0:
-                    p = here.row[h]
-                    east_m, north_m = entries[i].x_m - world.x_m[p], entries[i].y_m - world.y_m[p]
-                    nees = _nees(entries, i, east_m, north_m)
+                    _look(out.by_object[s], m, match)
+                    _look(out.by_distance[s], here.distance_band[h], match)
+                    _look(out.by_time[s], time_band, match)
+                if here.row[h] >= 0:
+                    _follow(out.by_object[s, m], m, match, issue_s[k], stays, so_far.unknown_since_s[s])
+                i, p = here.pair[h], here.row[h]
+                if i < 0:
+                    continue
+                entry, sums = entries[i], out.by_object[s, m]
+                then_east_m, then_north_m = entry.x_m - about.x_m[i], entry.y_m - about.y_m[i]
+                of, large_m2, small_m2 = nees(
+                    entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m
+                )
+                beyond, mean, second = expected(large_m2, small_m2, asked.gate_m)
+                square_m2, age_s = then_east_m**2 + then_north_m**2, issue_s[k] - entry.captured_s
+                _further(sums, entry, square_m2, beyond, second, age_s, m, so_far.last_track[s])
+                east_m = north_m = np.nan
+                if p >= 0:
+                    east_m, north_m = entry.x_m - world.x_m[p], entry.y_m - world.y_m[p]
                     out.error_m[s, column[m]] = np.hypot(east_m, north_m)
-                    _pair(out.by_object[s], m, east_m, north_m, nees)
-                    _pair(out.by_distance[s], here.distance_band[h], east_m, north_m, nees)
-                    _pair(out.by_time[s], time_band, east_m, north_m, nees)
-                    _further(out.by_object[s, m], entries, i, issue_s[k], world, p, at_capture)
+                    vx_mps, vy_mps = entry.vx_mps - world.vx_mps[p], entry.vy_mps - world.vy_mps[p]
+                    sums.velocity_square_m2ps2 += vx_mps**2 + vy_mps**2
+                _add_pair(out.by_object[s], m, east_m, north_m, of, mean)
+                _add_pair(out.by_distance[s], here.distance_band[h], east_m, north_m, of, mean)
+                _add_pair(out.by_time[s], time_band, east_m, north_m, of, mean)
             _gospa(out.gospa[s], column, out.by_object[s], out.by_run[s], targets, looked_at, believed, count, asked)
         for h in range(n):
             here.place_of[here.look[h]] = -1
@@ -173,7 +194,7 @@ def _gather(
     k: int, issue_s: float, world: World, stays: Stays, from_m: tuple[float, float], asked: Asked, here: _Here,
     targets: _Targets,
 ) -> tuple[int, int]:  # fmt: skip
-    # How many objects are in their stay at list k, and how many of them are looked at.
+    # How many objects are in their stay at list k, last those in a gap of the truth; and how many are looked at.
     n = looked_at = 0
     for p in range(world.start[k], world.start[k + 1]):
         m = stays.look_of[world.object_ix[p]]
@@ -187,29 +208,38 @@ def _gather(
             targets.look[looked_at], targets.x_m[looked_at], targets.y_m[looked_at] = m, world.x_m[p], world.y_m[p]
             looked_at += 1
         n += 1
+    for m in range(len(stays.lists)):
+        if here.place_of[m] < 0 and stays.first_list[m] <= k < stays.first_list[m] + stays.lists[m]:
+            here.look[n], here.row[n], here.place_of[m] = m, -1, n
+            here.distance_band[n] = here.target[n] = -1
+            n += 1
     return n, looked_at
 
 
 @nb.njit(cache=True, nogil=True)
 def _entries(
-    s: int, first: int, after: int, entries: Entries, object_ix: Int, role: NDArray[np.int8], stays: Stays,
+    s: int, first: int, after: int, entries: Entries, about: Found, now: Found, stays: Stays,
     from_m: tuple[float, float], time_band: int, asked: Asked, here: _Here, targets: _Targets, looked_at: int,
     believed: _Believed, out: Sums,
 ) -> int:  # fmt: skip
     # Find the matches in a list of run s, count its other entries, and say how many GOSPA counts.
     count = 0
     for i in range(first, after):
-        m = stays.look_of[object_ix[i]] if role[i] != GHOST else -1
+        if about.role[i] == MATCH:
+            m = stays.look_of[about.object_ix[i]]
+            if m >= 0 and here.place_of[m] >= 0:
+                here.pair[here.place_of[m]] = i
+        m = stays.look_of[now.object_ix[i]] if now.role[i] != GHOST else -1
         h = here.place_of[m] if m >= 0 else -1
         target = here.target[h] if h >= 0 else -1
-        if role[i] == MATCH and h >= 0:
+        if now.role[i] == MATCH and h >= 0:
             here.match[h] = i
-        elif role[i] == DUPLICATE and m >= 0:
+        elif now.role[i] == DUPLICATE and m >= 0:
             out.by_run[s].duplicates += 1
             if target >= 0:
                 out.by_object[s, m].duplicates += 1
-        measured = asked.measured_class[most_probable(entries, i)]
-        if target >= 0 or (role[i] == GHOST and measured):
+        measured = asked.measured_class[about.class_ix[i]]
+        if target >= 0 or (now.role[i] == GHOST and measured):
             believed.x_m[count], believed.y_m[count] = entries[i].x_m, entries[i].y_m
             count += 1
         if measured:
@@ -218,20 +248,27 @@ def _entries(
             claim = out.by_existence[s, min(max(int(existence * bins), 0), bins - 1)]
             claim.entries += 1
             claim.existence += existence
-            claim.with_object += role[i] != GHOST
-            if role[i] == GHOST:
-                _ghost(s, entries[i].x_m, entries[i].y_m, existence, from_m, time_band, asked, targets, looked_at, out)
+            claim.with_object += about.role[i] != GHOST
+            if now.role[i] == GHOST:
+                stale = about.role[i] != GHOST
+                _ghost(
+                    s, entries[i].x_m, entries[i].y_m, existence, stale, from_m, time_band, asked, targets, looked_at,
+                    out,
+                )  # fmt: skip
     return count
 
 
 @nb.njit(cache=True, nogil=True)
 def _ghost(
-    s: int, x_m: float, y_m: float, existence: float, from_m: tuple[float, float], time_band: int, asked: Asked,
-    targets: _Targets, looked_at: int, out: Sums,
+    s: int, x_m: float, y_m: float, existence: float, stale: bool, from_m: tuple[float, float], time_band: int,
+    asked: Asked, targets: _Targets, looked_at: int, out: Sums,
 ) -> None:  # fmt: skip
     out.by_run[s].ghosts += 1
-    for q in range(len(asked.existence_thresholds)):
-        out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
+    if stale:
+        out.by_run[s].stale_ghosts += 1
+    else:
+        for q in range(len(asked.existence_thresholds)):
+            out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
     distance_band = _band(asked.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
     if distance_band >= 0:
         out.by_distance[s, distance_band].ghosts += 1
@@ -251,30 +288,27 @@ def _look(records: Records, at: int, match: int) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _pair(records: Records, at: int, east_m: float, north_m: float, nees: float) -> None:
-    if at >= 0:
-        sums = records[at]
-        sums.pairs += 1
-        sums.square_m2 += east_m**2 + north_m**2
-        sums.east_m += east_m
-        sums.north_m += north_m
-        sums.nees += nees
+def _follow(sums: Any, m: int, match: int, issue_s: float, stays: Stays, unknown_since_s: Float) -> None:
+    # How long it is unknown, which goes on from list to list. −1: no match.
+    now_s = min(max(issue_s, stays.onset_s[m]), stays.ended_s[m])
+    if match < 0:
+        if np.isnan(unknown_since_s[m]):
+            unknown_since_s[m] = now_s
+    elif not np.isnan(unknown_since_s[m]):
+        sums.mtl_s = max(sums.mtl_s, now_s - unknown_since_s[m])
+        unknown_since_s[m] = np.nan
 
 
 @nb.njit(cache=True, nogil=True)
-def _follow(
-    sums: Any, m: int, entries: Entries, i: int, issue_s: float, stays: Stays, unknown_since_s: Float, last_track: Int
+def _further(
+    sums: Any, entry: Any, square_then_m2: float, beyond: float, second: float, age_s: float, m: int, last_track: Int
 ) -> None:
-    # What goes on from list to list: how long it is unknown, and as which track it is known. −1: no match.
-    now_s = min(max(issue_s, stays.onset_s[m]), stays.ended_s[m])
-    if i < 0:
-        if np.isnan(unknown_since_s[m]):
-            unknown_since_s[m] = now_s
-        return
-    if not np.isnan(unknown_since_s[m]):
-        sums.mtl_s = max(sums.mtl_s, now_s - unknown_since_s[m])
-        unknown_since_s[m] = np.nan
-    track = entries[i].track_id
+    # What only objects add up.
+    sums.square_then_m2 += square_then_m2
+    sums.beyond_gate += beyond
+    sums.nees_square_expected += second
+    sums.age_s += age_s
+    track = entry.track_id
     if track >= 0:
         sums.tracked += 1
         sums.switches += last_track[m] >= 0 and last_track[m] != track
@@ -282,15 +316,19 @@ def _follow(
 
 
 @nb.njit(cache=True, nogil=True)
-def _further(sums: Any, entries: Entries, i: int, issue_s: float, world: World, p: int, at_capture: World) -> None:
-    # What only objects add up: velocity, age, and the error against the truth at the capture.
-    entry = entries[i]
-    sums.velocity_square_m2ps2 += (entry.vx_mps - world.vx_mps[p]) ** 2 + (entry.vy_mps - world.vy_mps[p]) ** 2
-    sums.age_s += issue_s - entry.captured_s
-    q = _row_at(at_capture, entry.captured_s, world.object_ix[p])
-    if q >= 0:
-        sums.pairs_captured += 1
-        sums.square_captured_m2 += (entry.x_m - at_capture.x_m[q]) ** 2 + (entry.y_m - at_capture.y_m[q]) ** 2
+def _add_pair(records: Records, at: int, east_m: float, north_m: float, of: float, mean: float) -> None:
+    # NaN: the object is not there now.
+    if at < 0:
+        return
+    sums = records[at]
+    sums.pairs += 1
+    sums.nees += of
+    sums.nees_expected += mean
+    if not np.isnan(east_m):
+        sums.placed += 1
+        sums.square_m2 += east_m**2 + north_m**2
+        sums.east_m += east_m
+        sums.north_m += north_m
 
 
 @nb.njit(cache=True, nogil=True)
@@ -348,26 +386,3 @@ def _band(edges: Float, value: float) -> int:
     # The band that holds the value, its lower edge included, its upper one not; −1: none.
     band = int(np.searchsorted(edges, value, side="right")) - 1
     return band if band < len(edges) - 1 else -1
-
-
-@nb.njit(cache=True, nogil=True)
-def _row_at(world: World, time_s: float, object_ix: int) -> int:
-    # The row of an object in the frame captured then; −1: no such frame, or the object is not in it.
-    f = np.searchsorted(world.captured_s, time_s)
-    if f == len(world.captured_s) or (f > 0 and time_s - world.captured_s[f - 1] < world.captured_s[f] - time_s):
-        f -= 1
-    if f < 0 or abs(world.captured_s[f] - time_s) > _TOLERANCE_S:
-        return -1
-    there = world.object_ix[world.start[f] : world.start[f + 1]]
-    place = np.searchsorted(there, object_ix)
-    return world.start[f] + place if place < len(there) and there[place] == object_ix else -1
-
-
-@nb.njit(cache=True, nogil=True)
-def _nees(entries: Entries, i: int, east_m: float, north_m: float) -> float:
-    # eᵀ P⁻¹ e by the eigenvectors of P.
-    a, b, d = entries[i].cov_ee_m2, entries[i].cov_en_m2, entries[i].cov_nn_m2
-    half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
-    along = 0.5 * np.arctan2(2 * b, a - d)  # the direction of the larger eigenvalue
-    u, v = east_m * np.cos(along) + north_m * np.sin(along), north_m * np.cos(along) - east_m * np.sin(along)
-    return float(u * u / max(half + turn, SMALLEST_VARIANCE_M2) + v * v / max(half - turn, SMALLEST_VARIANCE_M2))

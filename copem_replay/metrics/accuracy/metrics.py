@@ -20,27 +20,27 @@ def _root(mean: float | None, power: float = 2.0) -> float | None:
 
 def position_rmse_m(of: Total) -> float | None:
     """Against the truth when the list is available."""
-    return _root(_ratio(of.looks["square_m2"], of.looks["pairs"]))
+    return _root(_ratio(of.looks["square_m2"], of.looks["placed"]))
 
 
 def position_rmse_captured_m(of: Total) -> float | None:
-    """Against the truth at capture."""
-    return _root(_ratio(of.looks["square_captured_m2"], of.looks["pairs_captured"]))
+    """Against the truth at the instant the entry tells of."""
+    return _root(_ratio(of.looks["square_then_m2"], of.looks["pairs"]))
 
 
 def velocity_rmse_mps(of: Total) -> float | None:
     """Against the truth when the list is available."""
-    return _root(_ratio(of.looks["velocity_square_m2ps2"], of.looks["pairs"]))
+    return _root(_ratio(of.looks["velocity_square_m2ps2"], of.looks["placed"]))
 
 
 def bias_east_m(of: Total) -> float | None:
-    """Mean error, entry minus truth."""
-    return _ratio(of.looks["east_m"], of.looks["pairs"])
+    """Mean error, entry minus truth when the list is available."""
+    return _ratio(of.looks["east_m"], of.looks["placed"])
 
 
 def bias_north_m(of: Total) -> float | None:
-    """Mean error, entry minus truth."""
-    return _ratio(of.looks["north_m"], of.looks["pairs"])
+    """Mean error, entry minus truth when the list is available."""
+    return _ratio(of.looks["north_m"], of.looks["placed"])
 
 
 def age_s(of: Total) -> float | None:
@@ -49,24 +49,39 @@ def age_s(of: Total) -> float | None:
 
 
 def nees(of: Total) -> float | None:
-    """Mean over pairs; 2 is right."""
+    """Mean over pairs; `nees_expected` is right."""
     return _ratio(of.looks["nees"], of.looks["pairs"])
 
 
+def nees_expected(of: Total) -> float | None:
+    """What it is on average where covariances are true: 2, less what the gate cuts off."""
+    return _ratio(of.looks["nees_expected"], of.looks["pairs"])
+
+
 def nees_low(of: Total) -> float | None:
-    """Lower limit of the mean of as many independent samples as rows have pairs, 95 %: χ²₂ₙ(0.025) / n."""
-    return _chi_squared(of.matched_rows, 0.025)
+    """Lower limit of the mean of as many independent samples as rows have pairs, 95 %; uncut χ²₂ₙ(0.025) / n."""
+    return _limit(of, 0.025)
 
 
 def nees_high(of: Total) -> float | None:
-    """Upper limit: χ²₂ₙ(0.975) / n."""
-    return _chi_squared(of.matched_rows, 0.975)
+    """Upper limit."""
+    return _limit(of, 0.975)
 
 
-def _chi_squared(n: int, level: float) -> float | None:
+def _limit(of: Total, level: float) -> float | None:
+    """Of the gamma distribution that has the mean and the variance of that mean of samples, as far as the gate lets."""
     from scipy.special import gammaincinv
 
-    return 2.0 * float(gammaincinv(n, level)) / n if n else None
+    mean, square = nees_expected(of), _ratio(of.looks["nees_square_expected"], of.looks["pairs"])
+    if mean is None or square is None:
+        return None
+    shape = of.matched_rows * mean**2 / (square - mean**2)
+    return mean * float(gammaincinv(shape, level)) / shape
+
+
+def beyond_gate_share(of: Total) -> float | None:
+    """Of errors as the covariances of pairs have them, how many the gate lets not through; mean over pairs."""
+    return _ratio(of.looks["beyond_gate"], of.looks["pairs"])
 
 
 def identity_switches(of: Total) -> float | None:
@@ -114,6 +129,11 @@ def ghosts_per_min(of: Total) -> float | None:
     return _ratio(60 * of.runs["ghosts"], of.runs["time_s"])
 
 
+def stale_ghosts_per_min(of: Total) -> float | None:
+    """Of these the ones that were about some object at the instant they tell of."""
+    return _ratio(60 * of.runs["stale_ghosts"], of.runs["time_s"])
+
+
 def duplicates_per_min(of: Total) -> float | None:
     """Entries, as ghosts; of measured objects, looked at or not."""
     return _ratio(60 * of.runs["duplicates"], of.runs["time_s"])
@@ -129,8 +149,9 @@ FIGURES: dict[str, Callable[[Total], float | None]] = {
     figure.__name__: figure
     for figure in (
         position_rmse_m, position_rmse_captured_m, bias_east_m, bias_north_m, velocity_rmse_mps, age_s,
-        gospa_m, gospa_localisation_m, gospa_missed_m, gospa_false_m, ospa_m, ghosts_per_min, duplicates_per_min,
-        nees, nees_low, nees_high, existence_error, identity_switches, mtl_s,
+        gospa_m, gospa_localisation_m, gospa_missed_m, gospa_false_m, ospa_m, ghosts_per_min,
+        stale_ghosts_per_min, duplicates_per_min, nees, nees_expected, nees_low, nees_high, beyond_gate_share,
+        existence_error, identity_switches, mtl_s,
     )
 }  # fmt: skip
 """Columns of the summary by name."""

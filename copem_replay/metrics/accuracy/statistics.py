@@ -5,16 +5,24 @@ distances from (the ego). Nothing is held from one list to the next, nothing wei
 *duplicate*, a *ghost*: `metrics/matching.py`. A look's *stay*: the lists from the first instant that object and ego share to the
 end of the look, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
 
-Over the matched pairs of the stay; never matched: no pairs, so nothing to average, and no say in the mean of others:
+What is said of an object is asked at the instant the entry *tells of*; what the list is worth *now* at the instant it
+is available. So there are matches of two kinds, by the same rules: *pairs* are entries that are about an object then.
 
-- position error (m): to the truth at the list's instant, so latency counts; *at capture*: to the truth at the entry's
-  `captured_s` (not counted where there is none within 1 µs). Bias (m): entry minus truth, east and north. Velocity
-  error (m/s): length of the difference. Age (s): available minus captured. RMSE: root mean square over pairs.
-- NEES (1): eᵀ P⁻¹ e of the position, P as claimed, its eigenvalues at least 1e-9 m²; 2 on average where P is true.
-  Its 95 % band is for as many independent samples as run × object pairs with a match, for lists are not independent.
-- identity switches (1): matches by another track than the object's last match that named a track.
+Over the pairs of the stay, a gap of the truth at the list's instant included; no pairs: nothing to average, and no say
+in the mean of others:
 
-Over a look; never matched: the worst there is:
+- position error (m): to the truth at the list's instant, so latency counts in full, whatever the gate; *at its
+  instant*: to the truth at the instant the entry tells of. Bias (m): entry minus truth, east and north. Velocity error
+  (m/s): length of the difference. RMSE: root mean square. Where the truth has a gap at the list's instant the pair is
+  not *placed*: it has neither position error nor bias nor velocity error, but all else.
+- age (s): available minus captured.
+- NEES (1): eᵀ P⁻¹ e of the position at the entry's instant, P as claimed, its eigenvalues at least 1e-9 m². The gate
+  lets no larger errors through, so where P is true the mean is `nees_expected`, 2 or less (`metrics/accuracy/nees.py`), and of what is
+  so claimed the share `beyond_gate` is no pair. Its 95 % band is for as many independent samples as run × object pairs
+  with a match, for lists are not independent.
+- identity switches (1): pairs of another track than the object's last pair that named a track.
+
+Over a look, by what is matched now; never matched: the worst there is:
 
 - longest time unknown (MTL, s): from onset to end it is known from a list with a match to the next list without one.
   The last list of the stay before the onset says whether it was known at the onset; before the first list it is
@@ -23,16 +31,17 @@ Over a look; never matched: the worst there is:
 
 Over all lists:
 
-- ghosts (1): of measured classes. Each goes to the nearest object looked at, if there is one.
+- ghosts (1): now, of measured classes. Each goes to the nearest object looked at, if there is one. *Stale* are those
+  that were about some object at the instant they tell of.
 - GOSPA (m, α = 2, cut-off c, power p): of what is looked at in a list against the entries that belong to it, and the
   ghosts; entries of what is not looked at now (an unmeasured object, the ego) are left out. Pairs are the best ones by
   distance, not those of the match. dᵖ, and cᵖ/2 of a miss, are the object's part, cᵖ/2 of a false entry is the part of
   the nearest one looked at. Mean of GOSPAᵖ over the lists in which something is looked at, to the power 1/p. Never
   matched: cᵖ/2 in each list.
 - OSPA (m): of the same two sets; mean over the same lists.
-- existence: calibrated when of the entries with existence p the share p is of an object. In ten bins of equal width,
-  over the entries of measured classes, duplicates being of an object too. Expected calibration error: mean over the
-  entries of their bin's |share − mean existence|.
+- existence: calibrated when of the entries with existence p the share p is of an object, at the instant they tell of.
+  In ten bins of equal width, over the entries of measured classes, duplicates being of an object too. Expected
+  calibration error: mean over the entries of their bin's |share − mean existence|.
 
 Sources: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001,
 5.4 (NEES); M. P. Naeini, G. F. Cooper, M. Hauskrecht, "Obtaining well calibrated probabilities using Bayesian binning",
@@ -55,7 +64,15 @@ EXISTENCE_BINS = 10
 """Of equal width (chosen)."""
 
 _LISTS = [("looked", "i8"), ("missed", "i8"), ("ghosts", "i8")]
-_PAIRS = [("pairs", "i8"), ("square_m2", "f8"), ("east_m", "f8"), ("north_m", "f8"), ("nees", "f8")]
+_PAIRS = [
+    ("pairs", "i8"),
+    ("placed", "i8"),  # of these, where the object is there when the list is available: of them the next three
+    ("square_m2", "f8"),
+    ("east_m", "f8"),
+    ("north_m", "f8"),
+    ("nees", "f8"),
+    ("nees_expected", "f8"),
+]
 BAND = np.dtype(_LISTS + _PAIRS)
 """Sums of one band: lists looked at, of these missed, ghosts; pairs, Σ e², Σ of the errors east and north, Σ NEES."""
 
@@ -63,9 +80,10 @@ OBJECT = np.dtype(
     [
         *_LISTS,
         *_PAIRS,
-        ("pairs_captured", "i8"),
-        ("square_captured_m2", "f8"),
-        ("velocity_square_m2ps2", "f8"),
+        ("nees_square_expected", "f8"),
+        ("beyond_gate", "f8"),
+        ("square_then_m2", "f8"),  # at the instants the entries tell of
+        ("velocity_square_m2ps2", "f8"),  # of placed ones
         ("age_s", "f8"),
         ("tracked", "i8"),  # pairs whose entry names a track
         ("switches", "i8"),
@@ -84,6 +102,7 @@ RUN = np.dtype(
         ("time_s", "f8"),  # that many times the mean spacing of neighbours among them
         ("ospa_m", "f8"),
         ("ghosts", "i8"),
+        ("stale_ghosts", "i8"),
         ("duplicates", "i8"),  # of measured objects, looked at or not
         ("lists_looked", "i8"),  # in which something is looked at
     ]
@@ -102,6 +121,7 @@ class Settings:
     """
 
     cutoff_m: float  # of GOSPA
+    gate_m: float  # of the matches
     power: float = 2.0
     distance_edges_m: tuple[float, ...] = ()
     time_edges_s: tuple[float, ...] = ()
@@ -115,11 +135,11 @@ class Accuracy:
     settings: Settings
     first_list: Int  # (M,) of the stay: its lists are first_list … first_list + count − 1
     count: Int  # (M,)
-    error_m: NDArray[np.float32]  # (S, L) look after look, L = Σ count: position error; NaN: not matched
+    error_m: NDArray[np.float32]  # (S, L) look after look, L = Σ count: position error; NaN: no placed pair
     gospa: NDArray[np.float32]  # (S, L) the object's part of GOSPAᵖ; NaN: not looked at
     by_object: Records  # (S, M) of OBJECT
     by_run: Records  # (S,) of RUN
-    ghosts_at: Int  # (S, T) ghosts of at least each of the existence thresholds
+    ghosts_at: Int  # (S, T) ghosts that are not stale of at least each of the existence thresholds
     by_distance: Records  # (S, bands) of BAND
     by_time: Records  # (S, bands) of BAND
     by_existence: Records  # (S, EXISTENCE_BINS) of EXISTENCE

@@ -26,7 +26,7 @@ def _ascending(value: tuple[float, float]) -> tuple[float, float]:
 def _one_turn(value: tuple[float, float]) -> tuple[float, float]:
     beyond = [angle for angle in value if abs(angle) > 360]
     if beyond:
-        raise ValueError(f"expected degrees from -360 to 360, found {beyond[0]:g}")
+        raise ValueError(f"expected degrees from -360 to 360, found {beyond[0]:g} (through 0: [350, 10])")
     return value
 
 

@@ -15,6 +15,7 @@ from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.results.compare.bootstrap import Draws, Whose
 from copem_replay.results.compare.comparable import check_comparable
 from copem_replay.results.compare.configuration_data import Side, side_of
+from copem_replay.results.compare.equal_ghosts import notes_on_equal_ghosts, why_not
 from copem_replay.results.compare.labels import Named, chosen, named
 from copem_replay.results.compare.limits import limits
 from copem_replay.results.compare.metrics import Regret, Setting, own_rate, regrets
@@ -102,13 +103,19 @@ def compare(
     draws = Draws(read[0].seed)
     rows: list[dict[str, object]] = []
     sides: list[Side] = []
+    reasons: dict[str, str | None] = {}
     for one in others:
         first = side_of(one, grid)
         _check_same_looks(one, first, against, second, grid)
         sides.append(first)
         cells = np.flatnonzero(first.there & second.there)
         pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
-        for regret in regrets(first, second, grid, setting):
+        reasons[one.label] = why_not(
+            first, second, setting.ghosts_per_min, asked=ghosts_per_min is not None,
+            truth=against.configuration in against.folder.truth,
+        )  # fmt: skip
+        mine = setting if reasons[one.label] is None else replace(setting, ghosts_per_min=None)
+        for regret in regrets(first, second, grid, mine):
             names = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
             fixed = _fixed(regret.metric, one, against)
             rows += (row | names for row in _rows(regret, pair, grid, draws, fixed=fixed))
@@ -126,6 +133,7 @@ def compare(
             *notes_on_pairs(against.label, second.there, {side.label: side.there for side in sides}),
             *note_on_measuring(against, others),
             *notes_on_instants(second, sides, grid.logs),
+            *notes_on_equal_ghosts(reasons),
             *notes_on_rows(table, setting.ghosts_per_min),
         ),
     )

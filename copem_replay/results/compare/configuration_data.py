@@ -39,7 +39,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Ghosts:
-    """Entries of a configuration that are at no object, by place; `at`: with those below each existence left out."""
+    """Entries of a configuration at no object, by place; `at`: of at least each existence, without stale ones."""
 
     there: Bool  # (L·S,)
     minutes: Float  # (L·S,)

@@ -9,7 +9,8 @@ horizon, who was still there when we stopped looking is censored.
 distance, so it differs infinitely from a distance, and not at all from never.
 *gospa_m*: a list counts where an object is measured in it, on or after its onset.
 *ttd_rmst_s_equal_ghosts*: ttd_rmst_s, with entries below a threshold of existence left out, so that each side has as
-many ghosts per minute over all logs and runs as is asked for. Between two thresholds (the second may leave nothing)
+many ghosts per minute over all logs and runs as is asked for, stale ones not counted; where that says something
+(`results/compare/equal_ghosts.py`). Between two thresholds (the second may leave nothing)
 it is their mixture that has exactly as many: a share of the drives goes by the one, the rest by the other, as between
 two points of a ROC curve. Resamples keep the thresholds and the share.
 """
@@ -155,7 +156,7 @@ def kept_at(ghosts: Ghosts, per_min: float) -> Kept | None:
 
 
 def own_rate(ghosts: Ghosts) -> float | None:
-    """Ghosts per minute at the lowest existence there is."""
+    """Ghosts per minute at the lowest existence there is, without stale ones."""
     minutes = float(ghosts.minutes[ghosts.there].sum())
     return float(ghosts.at[ghosts.there, 0].sum()) / minutes if len(ghosts.existence) and minutes > 0 else None
 
