@@ -8,7 +8,7 @@ K instants at which the receiver issues a fused list, U units, N entries of all 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,9 @@ COVARIANCES = ("cov_ee_m2", "cov_en_m2", "cov_nn_m2")
 
 Entries = NDArray[Any]
 """(N,) of ENTRY."""
+
+TellsOf = Literal["capture", "now"]
+"""Of which instant an entry tells: of its newest capture, or of the instant its list is available."""
 
 
 def entries_of(count: int) -> Entries:

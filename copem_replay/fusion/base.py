@@ -10,11 +10,9 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.components import Component, GivenError, asked, wrong
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports, TellsOf
 from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int
 
-TellsOf = Literal["capture", "now"]
-"""Of which instant an entry tells: of its newest capture, or of the instant its list is available."""
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 

@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 from copem_replay.core.agree import AGREE
 from copem_replay.core.components import NotNegative, Positive, Share
 from copem_replay.core.interpolation import wrap
-from copem_replay.core.object_list import ENTRY, Lists, Reports
+from copem_replay.core.object_list import ENTRY, Lists, Reports, TellsOf
 from copem_replay.core.tracks import Float, Int
-from copem_replay.fusion.base import ListFusion, TellsOf
+from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.content_order import rows_in_order
 from copem_replay.fusion.tracker_kernel import PREDICT, REPLAY, STALE, Rules, Said, fuse_run
 from copem_replay.fusion.tracker_memory import Remembered, nothing_yet

@@ -31,9 +31,8 @@ from numpy.typing import NDArray
 
 from copem_replay.core.agree import AGREE
 from copem_replay.core.agree import most_probable as most_probable_class
-from copem_replay.core.object_list import Entries, Lists
+from copem_replay.core.object_list import Entries, Lists, TellsOf
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
-from copem_replay.fusion.base import TellsOf
 
 MATCH, DUPLICATE, GHOST = 0, 1, 2
 """Roles of entries."""

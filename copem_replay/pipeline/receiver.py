@@ -12,12 +12,12 @@ import numpy as np
 from copem_replay.communication.arrivals import Instants, instants
 from copem_replay.communication.link import transmit
 from copem_replay.core.fused_tracks import Belief
-from copem_replay.core.object_list import Lists
+from copem_replay.core.object_list import Lists, TellsOf
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.fusion.base import Ideal, ListFusion, TellsOf, fused_by, resumed_by
+from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
 from copem_replay.perception.observation import Candidates

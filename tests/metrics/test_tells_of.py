@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from copem_replay.core.agree import AGREE
 from copem_replay.core.errors import InputError
-from copem_replay.core.object_list import Entries
+from copem_replay.core.object_list import Entries, TellsOf
 from copem_replay.core.tracks import CLASSES
-from copem_replay.fusion.base import Inbox, StepFusion, TellsOf, fused_by
+from copem_replay.fusion.base import Inbox, StepFusion, fused_by
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.nms import Nms
 from copem_replay.fusion.testing.check import NonconformingError, check_fusion
