@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from hashlib import blake2b
 
 import numba as nb
@@ -26,6 +27,7 @@ from copem_replay.core.tracks import Bool, Float, Int
 Words = NDArray[np.uint64]
 
 
+@lru_cache(2**16, typed=True)  # of the same few units and objects, stretch after stretch
 def stable_hash(*parts: str | int) -> int:
     """A 64-bit hash that is the same on every machine and in every process."""
     return int.from_bytes(blake2b(json.dumps(parts).encode(), digest_size=8).digest(), "little")

@@ -184,7 +184,7 @@ def _one_list(
             p = -1
             if frame[j] >= 0:
                 p = _nearest(
-                    entries[i].x_m, entries[i].y_m, bounds[frame[j]], bounds[frame[j] + 1], gate_m, agree[class_ix[i]],
+                    entries[i].x_m, entries[i].y_m, class_ix[i], bounds[frame[j]], bounds[frame[j] + 1], gate_m, agree,
                     row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, again == 1,
                 )  # fmt: skip
             if p < 0:
@@ -204,7 +204,7 @@ def _one_list(
     for i in others[:n]:
         f = frame[i - first]
         p = _nearest(
-            entries[i].x_m, entries[i].y_m, bounds[f], bounds[f + 1], gate_m, agree[class_ix[i]],
+            entries[i].x_m, entries[i].y_m, class_ix[i], bounds[f], bounds[f + 1], gate_m, agree,
             row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True,
         )  # fmt: skip
         if p >= 0:
@@ -218,22 +218,22 @@ def _one_list(
 
 @nb.njit(cache=True, nogil=True)
 def _nearest(
-    x: float, y: float, first: int, high: int, gate_m: float, fits: Bool, object_ix: Int, class_ix: NDArray[np.int8],
-    x_m: Float, y_m: Float, match_of: Int, only_free: bool,
+    x: float, y: float, of: int, first: int, high: int, gate_m: float, agree: Bool, object_ix: Int,
+    class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool,
 ) -> int:  # fmt: skip
-    # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western); −1: none.
-    least, best = gate_m * gate_m, -1
-    after = high
-    while first < after:  # the first row that is not too far west
-        middle = (first + after) // 2
-        if x_m[middle] < x - gate_m:
-            first = middle + 1
-        else:
-            after = middle
+    # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western), of a class that
+    # agrees with `of`; −1: none.
+    least, best, west_m = gate_m * gate_m, -1, x - gate_m
+    left = high - first
+    while left > 0:  # the first row that is not too far west; without branches, which nobody can foretell
+        half = left >> 1
+        too_far = x_m[first + half] < west_m
+        first = first + half + 1 if too_far else first
+        left = left - half - 1 if too_far else half
     for p in range(first, high):
         if x_m[p] > x + gate_m:
             break
-        if not fits[class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
+        if not agree[of, class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
             continue
         square = (x_m[p] - x) ** 2 + (y_m[p] - y) ** 2
         if square < least or (square == least and best < 0):

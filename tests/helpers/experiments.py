@@ -21,7 +21,7 @@ pems:
   onboard:
     - when: {range_m: [0, 80]}
       detection: {kind: constant, probability: 0.5}
-      error: {kind: gaussian, covariance_m2: [[1.0, 0.0], [0.0, 1.0]]}
+      error: {kind: gaussian, covariance_m2: [[0.5, 0.0], [0.0, 0.5]]}
 units:
   ego: {on: ego, height_m: 1.8, pem: onboard}
   mast: {at: [12.0, -4.5], height_m: 5.0, pem: onboard}

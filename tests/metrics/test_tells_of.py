@@ -23,6 +23,7 @@ from copem_replay.fusion.nms import Nms
 from copem_replay.fusion.testing.check import NonconformingError, check_fusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
+from copem_replay.io.recording import read
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match, match_both
 from copem_replay.pipeline.run import run
 from tests.helpers.reports import entry, joined, lists_of, reports_of
@@ -258,3 +259,40 @@ def test_error_grows_with_latency_as_far_as_the_object_goes() -> None:
 def test_calibration_does_not_go_by_latency() -> None:
     now, then = (late(latency_s, "gnn").summary["existence_error"].iloc[0] for latency_s in (0.0, 0.6))
     assert then == pytest.approx(now, abs=0.02)
+
+
+# -------------------------------------------------------------------------------------------------- real recordings
+
+SHARED = Path(__file__).parents[3] / "shared/data"
+
+
+@pytest.mark.parametrize(
+    ("name", "latency_s", "classes", "mast"),
+    [
+        ("av2_3b3570b4", 0.6, "vehicles", {"at": [76.1, 71.0], "yaw_deg": -90}),
+        ("drone_swerve", 0.5, "vehicles", {"at": [-61.9, 24.2], "yaw_deg": -90}),
+    ],
+)
+def test_of_real_traffic_late_lists_are_known_as_late_as_they_are(
+    name: str, latency_s: float, classes: str, mast: dict[str, Any]
+) -> None:
+    """What `init` proposes, all lists late. The first drive had 8.9 s for `gnn` and 3.9 s for the ideal."""
+    path = SHARED / f"{name}.mcap"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    couple = {
+        "when": {"range_m": [0, 80]},
+        "detection": {"kind": "visible_share"},
+        "error": {"kind": "gaussian", "frame": "line_of_sight", "covariance_m2": [[0.5, 0.0], [0.0, 0.1]]},
+    }
+    late = {"units": "all", "latency_s": latency_s}
+    plan = experiment(
+        runs=3, pems={"p": [couple]},
+        units={"ego": {"on": "ego", "pem": "p"}, "roadside": {"height_m": 6.0, "pem": "p"} | mast},
+        configurations={"ideal": late, "now": {"units": "all"}, "gnn": late | {"fusion": {"kind": "gnn"}}},
+        measure={"objects": {"classes": [classes]}, "accuracy": False},
+    )  # fmt: skip
+    summary = run(plan, [read(path, name=name)]).summary.set_index("configuration")
+    gnn_s, ideal_s, now_s = (summary.loc[one, "ttd_rmst_s"] for one in ("gnn", "ideal", "now"))
+    assert gnn_s == pytest.approx(ideal_s, abs=0.02)
+    assert now_s < ideal_s

@@ -188,7 +188,7 @@ def test_provenance_that_does_not_say_enough(tmp_path, key):
 def complete(tmp_path: Path) -> Path:
     """A folder with every table."""
     rows = [seen(name, [1, 1, 1, 1], [1, 1, 1, 1]) for name in ("ideal", "late")]
-    return write_folder(tmp_path / "first", rows, lists=[ghosts("ideal", 0), ghosts("late", 1)], steps=[])
+    return write_folder(tmp_path / "first", rows, lists=[ghosts("ideal", 20), ghosts("late", 20)], steps=[])
 
 
 def changed(path: Path, name: str, values: Any) -> None:

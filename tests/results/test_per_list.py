@@ -305,13 +305,13 @@ SURE = [step("ideal", 1.0, 0.5), step("late", 0.9, 3.0)]
             20,
             [ghosts("ideal", 0), ghosts("late", 60, existence=[0.0, 0.89, 0.91], ghosts_at=[60, 60, 0])],
             SURE,
-            f"late: {NONE}all its entries claim the same existence, so that none is left out before the others",
+            f"late: {NONE}all entries claim the same existence, so that none is left out before the others",
         ),
         (
             20,
             [ghosts("ideal", 60, existence=[0.0, 1.0], ghosts_at=[60, 60]), ghosts("late", 20)],
             SURE,
-            f"late: {NONE}of the baseline all its entries claim the same existence, so that none is left out before "
+            f"late: {NONE}of the baseline, all entries claim the same existence, so that none is left out before "
             "the others",
         ),
     ],

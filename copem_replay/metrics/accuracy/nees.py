@@ -22,7 +22,7 @@ _ROUND = np.cos((np.arange(16) + 0.5) * np.pi / 16)
 _NEARLY_ROUND = np.cos((np.arange(8) + 0.5) * np.pi / 8)
 """At 32 steps, which where the axes are alike give the same."""
 _ALIKE = 5.0
-"""Up to this ratio of eigenvalues they do, to six digits."""
+"""Up to this ratio of eigenvalues they do, to five digits."""
 _NONE = 80.0
 """From this t on nothing is beyond (chosen: e⁻⁴⁰ is less than a double tells from 0 beside 1)."""
 _SMALL = 1e-3

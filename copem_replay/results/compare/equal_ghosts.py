@@ -14,7 +14,7 @@ from copem_replay.results.compare.metrics import kept_at, own_rate
 FEWEST_GHOSTS = 10
 """Fewer entries than this decide nothing (chosen)."""
 TRUTH = "the baseline is the truth, which has no ghosts"
-ONE_VALUE = "all its entries claim the same existence, so that none is left out before the others"
+ONE_VALUE = "all entries claim the same existence, so that none is left out before the others"
 FEW = f"fewer than {FEWEST_GHOSTS} ghosts would decide"
 
 
@@ -37,7 +37,7 @@ def why_not(first: Side, second: Side, per_min: float | None, *, asked: bool, tr
         if own is None or kept is None or own <= per_min * (1 + 1e-9):
             continue
         if not _tells_apart(side.ghosts, side.steps):
-            return ONE_VALUE if side is first else f"of the baseline {ONE_VALUE}"
+            return ONE_VALUE if side is first else f"of the baseline, {ONE_VALUE}"
         minutes = float(side.ghosts.minutes[side.ghosts.there].sum())
         if kept.ghosts_per_min * minutes < FEWEST_GHOSTS * (1 - 1e-9):
             return FEW
