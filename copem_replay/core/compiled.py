@@ -36,12 +36,8 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
 
 
 def _folders(package: Path) -> list[str]:
-    """The package, and the packages in it."""
-    with os.scandir(package) as entries:
-        return [
-            str(package),
-            *(entry.path for entry in entries if entry.is_dir() and os.path.exists(f"{entry.path}/__init__.py")),
-        ]
+    """The package, and the packages in it, however deep."""
+    return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
 
 
 def _writable(folder: str | None) -> bool:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.core import compiled
+import copem_replay
 from tests.helpers.experiments import TEXT, drive
 from tests.system.test_cli import Call, call, raising
 
 __all__ = ["call"]  # a fixture
 
-PACKAGE = Path(compiled.__file__).parent
+PACKAGE = Path(copem_replay.__file__).parent
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -26,8 +26,8 @@ def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the package, beside whose files nothing can be cached, not even by root: that is a file."""
     folder = tmp_path_factory.mktemp("sealed")
     shutil.copytree(PACKAGE, folder / "copem_replay", ignore=shutil.ignore_patterns("__pycache__"))
-    for place in [folder / "copem_replay", *(path.parent for path in (folder / "copem_replay").glob("*/__init__.py"))]:
-        (place / "__pycache__").touch()
+    for path in (folder / "copem_replay").rglob("__init__.py"):
+        (path.parent / "__pycache__").touch()
     return folder
 
 
