@@ -9,7 +9,8 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from make_logs import long_drive, write_recording
+from copem_replay.io.write.osi_trace import write_osi_trace
+from make_logs import long_drive
 
 UNITS = """
   ego: {on: ego, height_m: 1.8, pem: lidar}
@@ -43,7 +44,7 @@ def long(folder: Path, minutes: Sequence[float] = (15, 60), objects: int = 100) 
     (folder / "city.yaml").write_text(EXPERIMENT)
     taken: list[tuple[float, float]] = []
     for length in minutes:
-        write_recording(long_drive(length, objects), folder / "city.mcap")
+        write_osi_trace(long_drive(length, objects), folder / "city.mcap")
         out = folder / "out"
         seconds, peak_mb = measured(["run", "city.yaml", "--out", "out", "--overwrite", "--jobs", "1"], folder)
         taken.append((seconds, peak_mb))

@@ -1,8 +1,8 @@
 """The containers of recordings: their channels, the payloads of some of them, what can be saved of a damaged file.
 
-Here it is MCAP; folders of rosbag2 are in `io/containers/rosbag2.py`, OSI's traces of a single channel in `io/containers/osi_trace.py`. An MCAP file with a
-sound index is read through it. Everything else (no index, an index that lies, a file that was cut off, a checksum that
-fails) is read from start to end, as far as it goes.
+Here it is MCAP; folders of rosbag2 are in `io/containers/rosbag2.py`, OSI's traces of a single channel in
+`io/containers/osi_trace.py`. An MCAP file with a sound index is read through it. Everything else (no index, an index
+that lies, a file that was cut off, a checksum that fails) is read from start to end, as far as it goes.
 """
 
 from __future__ import annotations
