@@ -51,8 +51,8 @@ class BrokenIndexError(Exception):
     """An index that seemed sound is not, or what it points at is damaged: `Log.from_start` is the way."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"{path}: the index cannot be used")
-        self.path = path
+        self.path, self.reason = path, "the index cannot be used"
+        super().__init__(f"{path}: {self.reason}")
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,13 @@ class _File(io.FileIO):
         try:
             return super().readinto(buffer)
         except OSError as error:
-            raise RecordingError(f"{self.name}: cannot be read: {error.strerror}") from None
+            raise RecordingError(f"cannot be read: {error.strerror}", path=Path(self.name)) from None
 
     def readall(self) -> bytes:
         try:
             return super().readall()
         except OSError as error:
-            raise RecordingError(f"{self.name}: cannot be read: {error.strerror}") from None
+            raise RecordingError(f"cannot be read: {error.strerror}", path=Path(self.name)) from None
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -144,7 +144,7 @@ def open_file(path: Path) -> IO[bytes]:
     try:
         return io.BufferedReader(_File(str(path)), _READ_AT_ONCE)
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be opened: {error.strerror}") from None
+        raise RecordingError(f"cannot be opened: {error.strerror}", path=path) from None
 
 
 def open_log(path: Path) -> Log:
@@ -176,9 +176,11 @@ def name_of(path: Path) -> str:
 def open_mcap(path: Path) -> Log:
     """Look at an MCAP file. Raises RecordingError."""
     if not path.exists():
-        raise RecordingError(f"{path}: no such file")
+        raise RecordingError("no such file", path=path)
     if not path.is_file():
-        raise RecordingError(f"{path}: expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}")
+        raise RecordingError(
+            f"expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}", path=path
+        )
     with open_file(path) as file:
         check_magic(path, file)
         try:
@@ -218,7 +220,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
         )
     damage = _reason(error) if error else None
     if damage and not sum(counts.values()):
-        raise RecordingError(f"{path}: damaged, and no message can be read ({damage})")
+        raise RecordingError(f"damaged, and no message can be read ({damage})", path=path)
     if damage and stream.complete:
         damage = f"its index cannot be used ({damage}): read from start to end, no message is lost"
     return Log(

@@ -46,9 +46,9 @@ def _read(log: container.Log, topic: str, scene: Scene, around: Surroundings | N
         return None
     mine = [c for c in channels if c.schema == channels[0].schema]
     if log.window is not None and next(log.payloads(frozenset(c.number for c in mine)), None) is None:
-        raise RecordingError(f"{log.path}: {topic}: holds no list in the window")
+        raise RecordingError("holds no list in the window", path=log.path, topic=topic)
     around = around or surroundings(log, None, seek_ego=False)
-    found = in_world(lists_of(log, mine, None), around, f"{log.path}: {topic}")
+    found = in_world(lists_of(log, mine, None), around, log.path, topic)
     return _recorded(found, _details(log, topic), topic, scene)
 
 

@@ -133,7 +133,7 @@ def _no_lists(log: container.Log, topic: str) -> str:
 def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == sensor_data.SCHEMA}
     if not chosen:
-        raise RecordingError(f"{log.path}: {_no_lists(log, topic)}")
+        raise RecordingError(_no_lists(log, topic), path=log.path)
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == detail.SCHEMA}
     rows = _Rows()
@@ -146,10 +146,10 @@ def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, An
             try:
                 message = sensor_data.message_class().FromString(payload)
             except DecodeError as error:
-                raise RecordingError(f"{log.path}: {topic}: a message cannot be decoded: {error}") from None
+                raise RecordingError(f"a message cannot be decoded: {error}", path=log.path, topic=topic) from None
             _add(rows, message, log_time_ns)
             if max(map(abs, rows.stamps[-1])) > LAST_NS:
-                raise RecordingError(f"{log.path}: {topic}: a message has an impossible time stamp")
+                raise RecordingError("a message has an impossible time stamp", path=log.path, topic=topic)
     return rows, details
 
 

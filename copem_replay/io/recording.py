@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.errors import RecordingError
+from copem_replay.core.errors import EgoError, RecordingError
 from copem_replay.core.text import counted, printable
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io import log as container
@@ -29,6 +29,7 @@ if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not
     from copem_replay.io.schemas.object_lists import Fields
     from copem_replay.io.world_frame import Surroundings
 
+_TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
 _SHOWN = 12  # ids or topics named in an error (chosen)
 
 
@@ -106,7 +107,7 @@ def read_log(
         inside = "the window" if log.window is not None else messages
         damage = _damage(log, topic, None)
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
-        raise RecordingError(f"{log.path}: {topic}: no usable object in {inside}{why}")
+        raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
     host, said = _host(columns.hosts)
     ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _damage(log, topic, scene.end_s)
@@ -155,7 +156,7 @@ def choose_topic(
 ) -> tuple[str, list[str]]:
     """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
     if not any(c.messages for c in log.channels):
-        raise RecordingError(f"{log.path}: holds no message ({_listed(log.channels) or 'and no channel'})")
+        raise RecordingError(f"holds no message ({_listed(log.channels) or 'and no channel'})", path=log.path)
     topics = truth_topics(log)
     if topic is not None and foreign(log):
         from copem_replay.io.world_frame import known_lists
@@ -164,20 +165,25 @@ def choose_topic(
     if fields is not None:
         topics = {c.topic: c.schema for c in log.channels if c.messages}
         if topic not in topics:
-            raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; messages are on {_named(topics)}")
+            raise RecordingError(
+                f"no true objects on topic {topic!r}; messages are on {_named(topics)}", path=log.path, key=_TOPIC
+            )
         return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
     if not topics:
         raise RecordingError(
-            f"{log.path}: no list of true objects; it holds {_listed(log.channels)}; "
-            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
+            f"no list of true objects; it holds {_listed(log.channels)}; "
+            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)",
+            path=log.path,
         )
     if topic is not None and topic not in topics:
-        raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; they are on {_named(topics)}")
+        raise RecordingError(
+            f"no true objects on topic {topic!r}; they are on {_named(topics)}", path=log.path, key=_TOPIC
+        )
     chosen = topic if topic is not None else _only(topics)
     if chosen is None:
         raise RecordingError(
-            f"{log.path}: true objects on several topics, {_named(topics)}: "
-            "choose one with `read: {topic: …}` in the experiment"
+            f"true objects on several topics, {_named(topics)}: choose one with `read: {{topic: …}}` in the experiment",
+            path=log.path,
         )
     poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
     return chosen, _ignored(log, chosen, topics, beside, poses_read=poses_read)
@@ -220,7 +226,9 @@ def _columns(
         channels = [c for c in channels if is_truth(c) or is_list(c)]
         channels.sort(key=lambda c: not names_objects(c))
     if not channels:
-        raise RecordingError(f"{log.path}: {topic}: no message can be read{f' ({log.damage})' if log.damage else ''}")
+        raise RecordingError(
+            f"no message can be read{f' ({log.damage})' if log.damage else ''}", path=log.path, topic=topic
+        )
     if fields is None and any(is_truth(c) for c in channels):
         columns = _decode(log, topic)
         if asked is None:
@@ -237,10 +245,10 @@ def _columns(
     found = lists_of(log, mine, fields)
     if (fields is None and not names_objects(mine[0])) or (fields is not None and fields.id is None):
         raise RecordingError(
-            f"{log.path}: {topic}: its objects have no ids; lists of a unit they can be, not the truth"
+            "its objects have no ids; lists of a unit they can be, not the truth", path=log.path, topic=topic
         )
     world = around.world_of(found)
-    found = in_world(found, around, f"{log.path}: {topic}")
+    found = in_world(found, around, log.path, topic)
     return _with_notes(with_ego(found.columns, around), around), around, world
 
 
@@ -291,7 +299,7 @@ def _ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[i
     if index >= 0 and scene.moving[index]:
         return index, []
     if ego is not None:
-        raise RecordingError(f"{path}: ego: no moving object {ego!r}; there are {moving_ids(scene)}")
+        raise EgoError(f"no moving object {ego!r}; there are {moving_ids(scene)}", path=path)
     if host is not None:
         return -1, [f"the host vehicle {host} is not among the moving objects: no ego vehicle"]
     return -1, []

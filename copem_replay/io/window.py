@@ -73,8 +73,10 @@ def cut_out(log: Log, topic: str, window_s: WindowSeconds) -> Log:
     if next(cut.payloads(numbers), None) is None:
         span_s = (_last_ns(log, numbers) - first_ns) * 1e-9
         raise EmptyWindowError(
-            f"{log.path}: {topic}: no message in the window {in_words(from_s, to_s)}; there are some from 0 to "
-            f"{span_s:.10g} s"
+            f"no message in the window {in_words(from_s, to_s)}; there are some from 0 to {span_s:.10g} s",
+            path=log.path,
+            topic=topic,
+            key=("window_s",),
         )
     return cut
 

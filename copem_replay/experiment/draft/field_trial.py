@@ -45,8 +45,12 @@ def proposals(log: Log, name: str) -> Iterator[tuple[dict[str, Any], Recording |
             try:
                 fields = Fields.model_validate({key: v for key, v in found["read"].items() if key != "topic"})
                 recording = read_log(log, name=name, topic=channel.topic, fields=fields)
-            except (RecordingError, BrokenIndexError, ValidationError) as error:
-                problem = str(error).removeprefix(f"{log.path}: ")
+            except RecordingError as error:
+                problem = "; ".join(error.within(log.path))
+            except BrokenIndexError as error:
+                problem = error.reason
+            except ValidationError as error:
+                problem = str(error)
         yield found | {"problem": problem}, recording
 
 

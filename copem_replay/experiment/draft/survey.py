@@ -133,7 +133,7 @@ def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[di
         try:
             found = _lists(recording, topic, of_osi=topic in osis)
         except RecordingError as error:
-            yield said | {"problem": str(error).removeprefix(f"{recording.path}: ").removeprefix(f"{topic}: ")}
+            yield said | {"problem": "; ".join(error.within(recording.path, topic))}
             continue
         said |= {"lists": len(found.tracks.stamp_ns), "entries": len(found.tracks.frame_ix)}
         said |= {"covariances_said": bool(found.spread_said.all()), "captures_said": bool(found.capture_said.all())}
@@ -150,7 +150,7 @@ def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:
 
     found = read_listed(recording.path, topic, recording.scene, recording.around)
     if found is None:
-        raise RecordingError(f"{topic}: holds no list")
+        raise RecordingError("holds no list", path=recording.path, topic=topic)
     return found
 
 

@@ -94,7 +94,7 @@ def open_trace(path: Path) -> Trace:
     notes += [f"{counted(number, 'message')} {what}: skipped" for what, number in skipped.items()]
     if not offsets:
         why = "; ".join([*cut, *notes])
-        raise RecordingError(f"{path}: {'damaged, and ' if cut else ''}no message of {schema} can be read ({why})")
+        raise RecordingError(f"{'damaged, and ' if cut else ''}no message of {schema} can be read ({why})", path=path)
     order = np.argsort(np.array(times_ns), kind="stable")
     expected = int(said["frames"]) if said and cut else None
     topic = schema.removeprefix("osi3.")
@@ -159,7 +159,9 @@ def _time_ns(message: Any) -> int | None:
 def _schema(path: Path, named: str) -> tuple[str, list[str]]:
     """What the messages are, and a note where the file's name does not say. Raises RecordingError."""
     if named in _NOT_READ:
-        raise RecordingError(f"{path}: osi3.{_NOT_READ[named]} by its name, which is not read; {', '.join(_READ)} are")
+        raise RecordingError(
+            f"osi3.{_NOT_READ[named]} by its name, which is not read; {', '.join(_READ)} are", path=path
+        )
     with open_file(path) as file:
         first = [payload for _, payload in islice(_payloads(file, []), _TRIED)]
         if not first:
@@ -173,8 +175,9 @@ def _schema(path: Path, named: str) -> tuple[str, list[str]]:
         by_name = f"says {named}" if named in _READ else "does not say"
         return best, [f"taken for {best} by its messages: the name of the file {by_name}"]
     raise RecordingError(
-        f"{path}: its messages can be told for none of {', '.join(share)}; if they are, name the file by OSI's "
-        f"convention: 20260102T030405Z_gt_380_2961_{len(first)}_name.osi"
+        f"its messages can be told for none of {', '.join(share)}; if they are, name the file by OSI's "
+        f"convention: 20260102T030405Z_gt_380_2961_{len(first)}_name.osi",
+        path=path,
     )
 
 
