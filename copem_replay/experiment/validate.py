@@ -15,7 +15,7 @@ from copem_replay.experiment.cross_references import NO_EGO, references
 from copem_replay.experiment.file import Problem, Source, is_there, log_paths, named_paths, parse
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.config import ReadFields
-from copem_replay.io.log import name_of
+from copem_replay.io.open import name_of
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
 from copem_replay.perception.config import Carriers

@@ -16,11 +16,14 @@ import numpy as np
 from copem_replay.core.errors import EgoError, RecordingError
 from copem_replay.core.text import counted, printable
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
-from copem_replay.io import log as container
+from copem_replay.io.channel import Channel
 from copem_replay.io.ground_truth import assemble
-from copem_replay.io.log import Channel, Log
+from copem_replay.io.log import BrokenIndexError, Log
+from copem_replay.io.open import open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import Columns
+from copem_replay.io.schemas.pose_schemas import is_pose
+from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
 from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
 
 if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
@@ -76,7 +79,7 @@ def read(
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several; EmptyWindowError.
     """
-    log = container.open_log(Path(path))
+    log = open_log(Path(path))
     return read_log(log, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
 
 
@@ -97,7 +100,7 @@ def read_log(
     try:
         log = cut_out(log, topic, window_s)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
-    except container.BrokenIndexError as error:
+    except BrokenIndexError as error:
         log = cut_out(log.from_start(error), topic, window_s)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     scene, truth, found = assemble(columns, name)
@@ -135,10 +138,7 @@ def truth_topics(log: Log) -> dict[str, str]:
     ours = {c.topic for c in log.channels if c.topic.startswith("copem/")}
     if osis or not foreign(log):
         return osis
-    from copem_replay.io.schemas.registry import names_objects
-    from copem_replay.io.world_frame import known_lists
-
-    others = {c.topic: c.schema for c in known_lists(log) if names_objects(c)}
+    others = {c.topic: c.schema for c in known_lists(log.channels) if names_objects(c)}
     return {t: schema for t, schema in others.items() if t not in ours} or others
 
 
@@ -159,9 +159,7 @@ def choose_topic(
         raise RecordingError(f"holds no message ({_listed(log.channels) or 'and no channel'})", path=log.path)
     topics = truth_topics(log)
     if topic is not None and foreign(log):
-        from copem_replay.io.world_frame import known_lists
-
-        topics |= {c.topic: c.schema for c in known_lists(log) if c.topic == topic}
+        topics |= {c.topic: c.schema for c in known_lists(log.channels) if c.topic == topic}
     if fields is not None:
         topics = {c.topic: c.schema for c in log.channels if c.messages}
         if topic not in topics:
@@ -202,8 +200,6 @@ def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[s
     skipped = Counter[str]()
     poses: set[int] = set()
     if poses_read and (others := foreign(log)):
-        from copem_replay.io.schemas.poses import is_pose
-
         poses = {c.number for c in others if is_pose(c)}
     for channel in log.channels:
         there = channel.messages and channel.number not in poses
@@ -221,8 +217,6 @@ def _columns(
     """All that is on a topic, in the world, and the ego; the world's name. Raises RecordingError, BrokenIndexError."""
     channels = [c for c in log.channels if c.topic == topic and c.messages]
     if fields is None and any(not is_truth(c) for c in channels):  # channels of one topic may be of several schemas
-        from copem_replay.io.schemas.registry import is_list, names_objects
-
         channels = [c for c in channels if is_truth(c) or is_list(c)]
         channels.sort(key=lambda c: not names_objects(c))
     if not channels:
@@ -237,7 +231,6 @@ def _columns(
 
         around = surroundings(log, asked, seek_ego=False)
         return _with_notes(with_ego(columns, around), around), around, ""
-    from copem_replay.io.schemas.registry import names_objects
     from copem_replay.io.world_frame import in_world, lists_of, surroundings, with_ego
 
     around = surroundings(log, asked, seek_ego=seek_ego)

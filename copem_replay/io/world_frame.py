@@ -17,12 +17,15 @@ from copem_replay.core.errors import EgoError, RecordingError
 from copem_replay.core.rotation import turned, yaw_of
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, VALUES, Float
+from copem_replay.io.channel import Channel, schema_name
+from copem_replay.io.encodings.definition import definition_of
 from copem_replay.io.encodings.raw_values import DefinitionError
-from copem_replay.io.log import Channel, Log
+from copem_replay.io.log import Log
 from copem_replay.io.schemas.decoded import LAST_NS, Columns
 from copem_replay.io.schemas.object_lists import Description, Fields, FieldsError, Listed, listed
-from copem_replay.io.schemas.poses import ODOMETRY, Poses, is_pose, poses_of
-from copem_replay.io.schemas.registry import definition_of, description_of, is_list, schema_name
+from copem_replay.io.schemas.pose_schemas import ODOMETRY, is_pose
+from copem_replay.io.schemas.poses import Poses, poses_of
+from copem_replay.io.schemas.registry import description_of
 from copem_replay.io.transforms import Course, Frames, course_of
 
 if TYPE_CHECKING:
@@ -275,8 +278,3 @@ def with_ego(columns: Columns, around: Surroundings) -> Columns:
 
 def _stacked(first: Float, second: Float) -> Float:
     return np.concatenate([first, second])
-
-
-def known_lists(log: Log) -> list[Channel]:
-    """Channels of object lists that are known by their schemas, OSI aside, and hold messages."""
-    return [c for c in log.channels if is_list(c) and c.messages]

@@ -23,9 +23,10 @@ from mcap.records import Message
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.text import counted
-from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES
+from copem_replay.io.channel import Channel
+from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES, MAGIC
 from copem_replay.io.containers.unsupported import other_than
-from copem_replay.io.log import Channel, Log, open_file
+from copem_replay.io.log import Log, open_file
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.osi_ground_truth import GROUND_TRUTH, SENSOR_DATA, SENSOR_VIEW
 
@@ -64,6 +65,14 @@ class Trace(Log):
                     file.seek(self.offsets[k])
                     time_ns = self.times_ns[k]
                     yield Message(number, time_ns, file.read(self.lengths[k]), time_ns, 0)
+
+
+def is_trace(path: Path) -> bool:
+    """Whether a file is to be read as OSI's trace of a single channel: by its name, unless it is MCAP all the same."""
+    if path.suffix.lower() != ".osi" or not path.is_file():
+        return False
+    with open_file(path) as file:
+        return file.read(len(MAGIC)) != MAGIC
 
 
 def open_trace(path: Path) -> Trace:

@@ -16,9 +16,10 @@ from mcap.records import Message
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.text import counted
+from copem_replay.io.channel import Channel
 from copem_replay.io.containers.mcap_indexed import renumbered
 from copem_replay.io.containers.rosbag2_metadata import files_of, unnamed_in
-from copem_replay.io.log import BrokenIndexError, Channel, Log, from_start, open_mcap
+from copem_replay.io.log import BrokenIndexError, Log, from_start, open_mcap
 from copem_replay.io.window import Window, overlap
 
 
