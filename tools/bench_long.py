@@ -10,7 +10,8 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from make_logs import long_drive, write_recording
+from copem_replay.io.write.osi_trace import write_osi_trace
+from make_logs import long_drive
 
 CROWD = """
 version: 1
@@ -40,7 +41,7 @@ def long(folder: Path, minutes: Sequence[float] = (20, 60), objects: int = 100) 
     """
     taken: list[tuple[float, float]] = []
     for length in minutes:
-        write_recording(long_drive(length, objects), folder / "city.mcap")
+        write_osi_trace(long_drive(length, objects), folder / "city.mcap")
         begun = subprocess.run(_command(["init", "city.mcap"]), cwd=folder, check=True, capture_output=True, text=True)
         (folder / "city.yaml").write_text(re.sub(r"(?m)^runs: \d+", "runs: 2", begun.stdout))
         out = folder / "out"

@@ -22,12 +22,13 @@ from scipy.optimize import minimize
 
 from copem_replay.experiment.file import load
 from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.write.osi_trace import write_osi_trace
 from copem_replay.metrics.braking.driver import ConstantDeceleration, GammaReaction
 from copem_replay.metrics.braking.verdict import pass_probability, passing
 from copem_replay.metrics.survival import wilson
 from copem_replay.pipeline.closed_form import distributions
 from copem_replay.pipeline.log_replay import Replay, prepare
-from make_logs import tc016d, write_recording
+from make_logs import tc016d
 from paper import PASSED, RUNS
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -81,7 +82,7 @@ class Scenario:
     def _prepared(self, edge_m: float) -> Replay:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "tc016d.mcap"
-            write_recording(tc016d(edge_m), path)
+            write_osi_trace(tc016d(edge_m), path)
             (recording,), refused = read_logs(self.experiment, [path], None)
         assert not refused
         return prepare(recording, self.experiment)

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from make_logs import NANOS_PER_SECOND, Body, Recording, ground_truth
+from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace
+from make_logs import SOURCE, Body, ground_truth
 from make_logs import Kind as Vehicle
 
 RATE_HZ, FRAMES, EGO = 10, 601, 1
@@ -290,10 +291,11 @@ def frames() -> Iterator[tuple[int, list[Body]]]:
             user.way_m += (before + user.speed_mps) / 2 / RATE_HZ
 
 
-def crossing() -> Recording:
+def crossing() -> OsiTrace:
     """Return the busy crossing: onboard, roadside and V2V perception see very different parts of it."""
     still = street_furniture()
-    return Recording(
+    return OsiTrace(
+        source=SOURCE,
         description="A busy signalised crossing: an ego vehicle that turns left, pedestrians and cyclists half hidden.",
         topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users and the street furniture"},
         messages=(("ground_truth", ground_truth(t, moving, still, host_id=EGO)) for t, moving in frames()),

@@ -39,9 +39,9 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
     """
     from copem_replay.core.errors import InputError, RecordingError
     from copem_replay.experiment.draft.survey import describe, survey
-    from copem_replay.io import log as container
     from copem_replay.io import recorded_lists as unit_lists
     from copem_replay.io import recorded_osi as lists
+    from copem_replay.io.open import open_log
     from copem_replay.io.recording import read
     from copem_replay.io.schemas import osi_ground_truth as osi
     from copem_replay.io.write.source import source_of
@@ -65,7 +65,7 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
             if (end == READ) > found["readable"]:
                 return {"outcome": "defect", "what": "read, but the survey says it cannot be"}
             if recording is not None:
-                for topic in {c.topic: c.schema for c in container.open_log(path).channels if c.messages}.items():
+                for topic in {c.topic: c.schema for c in open_log(path).channels if c.messages}.items():
                     try:
                         if topic[1] == osi.SENSOR_DATA:
                             lists.read_recorded(path, topic[0], recording.scene)

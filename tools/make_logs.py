@@ -3,7 +3,7 @@
     python tools/make_logs.py [tc016d …] [--out logs]
     python tools/make_logs.py --long --out FOLDER [--minutes 60] [--objects 100]
 
-A recording is an OSI multi-channel trace (MCAP). A further one is a function that returns a `Recording`, in a
+A recording is an OSI multi-channel trace (MCAP). A further one is a function that returns an `OsiTrace`, in a
 module beside this one, say, and an entry in `recipes`. Axes in metres: x along the road, y to its left, z up.
 Times in seconds since the first frame, which has stamp 0.
 """
@@ -12,32 +12,18 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import google.protobuf
-import osi3
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import build_file_descriptor_set
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_object_pb2 import MovingObject, StationaryObject
 
+from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
+
 Kind = MovingObject.VehicleClassification
-NANOS_PER_SECOND: Final = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What goes into one file."""
-
-    description: str
-    topics: Mapping[str, str]  # topic: what is on it
-    messages: Iterable[tuple[str, Any]]  # (topic, message), in the order of their `timestamp`
-    source: str = "synthetic (tools/make_logs.py)"
-    records: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # further metadata; taken after the messages
+SOURCE: Final = "synthetic (tools/make_logs.py)"
 
 
 # What moves, and how ----------------------------------------------------------------------------------------
@@ -112,11 +98,7 @@ def stationary_object(body: Body) -> StationaryObject:
 
 def ground_truth(stamp_ns: int, moving: list[Body], stationary: list[Body], host_id: int) -> GroundTruth:
     """Return all bodies at one instant."""
-    osi = GroundTruth()
-    parts = (int(part) for part in osi3.__version__.split(".")[:3])
-    osi.version.version_major, osi.version.version_minor, osi.version.version_patch = parts
-    osi.timestamp.seconds, osi.timestamp.nanos = divmod(stamp_ns, NANOS_PER_SECOND)
-    osi.host_vehicle_id.value = host_id
+    osi = empty_ground_truth(stamp_ns, host_id)
     osi.moving_object.extend(moving_object(body, stamp_ns / NANOS_PER_SECOND) for body in moving)
     osi.stationary_object.extend(stationary_object(body) for body in stationary)
     return osi
@@ -176,80 +158,35 @@ def tc016d_units() -> list[dict[str, Any]]:
     ]
 
 
-def tc016d(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> Recording:
+def tc016d(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> OsiTrace:
     """Return the scenario of the paper: a pedestrian steps out from behind a truck, 20 m ahead of the ego."""
     moving, stationary = tc016d_bodies(truck_edge_m)
     stamps_ns = (frame * NANOS_PER_SECOND // TC016D_RATE_HZ for frame in range(TC016D_FRAMES))
-    return Recording(
+    return OsiTrace(
+        source=SOURCE,
         description="A parked truck hides a pedestrian who starts to cross 20 m ahead of the ego vehicle.",
         topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users and the bus shelter"},
         messages=(("ground_truth", ground_truth(t, moving, stationary, host_id=1)) for t in stamps_ns),
     )
 
 
-def recipes() -> dict[str, Callable[[], Recording]]:
+def recipes() -> dict[str, Callable[[], OsiTrace]]:
     """Return every recording by the name of its file; recipes of other modules are imported in here."""
     from crossing import crossing
 
     return {"tc016d": tc016d, "crossing": crossing}
 
 
-def long_drive(minutes: float, objects: int = 100) -> Recording:
+def long_drive(minutes: float, objects: int = 100) -> OsiTrace:
     """Return a drive of many minutes through a city: for what long recordings cost."""
     from city import city
 
-    return Recording(
+    return OsiTrace(
+        source=SOURCE,
         description=f"A drive of {minutes:g} minutes among {objects} objects at a time: a load, no traffic.",
         topics={"ground_truth": "osi3.GroundTruth, 10 Hz: all road users"},
         messages=city(minutes, objects),
     )
-
-
-# Writing ----------------------------------------------------------------------------------------------------
-
-
-def write_recording(recording: Recording, path: Path) -> None:
-    """Write an OSI multi-channel trace; the file is there in full or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with temporary.open("wb") as stream:
-            writer = Writer(stream, compression=CompressionType.ZSTD)
-            writer.start(profile="", library="copem_replay")
-            _write_content(writer, recording)
-            writer.finish()
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _write_content(writer: Writer, recording: Recording) -> None:
-    osi_version, protobuf_version = osi3.__version__, google.protobuf.__version__
-    trace = {
-        **dict.fromkeys(("version", "min_osi_version", "max_osi_version"), osi_version),
-        **dict.fromkeys(("min_protobuf_version", "max_protobuf_version"), protobuf_version),
-        "description": recording.description,
-        "authors": "copem_replay",
-        "data_sources": recording.source,
-    }  # neither creation_time nor zero_time: the first would be a clock, and the scene has no date
-    writer.add_metadata("net.asam.osi.trace", dict(sorted(trace.items())))
-    prefix = "net.asam.osi.trace.channel."
-    versions = {f"{prefix}osi_version": osi_version, f"{prefix}protobuf_version": protobuf_version}
-    schema_ids: dict[str, int] = {}
-    channel_ids: dict[str, int] = {}
-    for topic, message in recording.messages:
-        schema = message.DESCRIPTOR.full_name
-        if schema not in schema_ids:
-            files = build_file_descriptor_set(type(message)).SerializeToString(deterministic=True)
-            schema_ids[schema] = writer.register_schema(schema, "protobuf", files)
-        if topic not in channel_ids:
-            metadata = {f"{prefix}description": recording.topics[topic]} | versions
-            channel_ids[topic] = writer.register_channel(topic, "protobuf", schema_ids[schema], metadata)
-        stamp_ns = message.timestamp.seconds * NANOS_PER_SECOND + message.timestamp.nanos
-        data = message.SerializeToString(deterministic=True)
-        writer.add_message(channel_ids[topic], stamp_ns, data, publish_time=stamp_ns)
-    for name, record in sorted(recording.records.items()):
-        writer.add_metadata(name, dict(sorted(record.items())))
 
 
 def main() -> None:
@@ -262,12 +199,12 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=100, help="how many there are at a time (default: 100)")
     arguments = parser.parse_args()
     if arguments.long:
-        write_recording(long_drive(arguments.minutes, arguments.objects), arguments.out / "city.mcap")
+        write_osi_trace(long_drive(arguments.minutes, arguments.objects), arguments.out / "city.mcap")
         return
     if unknown := set(arguments.names) - set(recipes()):
         parser.error(f"no recipe for {', '.join(sorted(unknown))}; there are: {', '.join(recipes())}")
     for name in arguments.names or recipes():
-        write_recording(recipes()[name](), arguments.out / f"{name}.mcap")
+        write_osi_trace(recipes()[name](), arguments.out / f"{name}.mcap")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ try:  # before `main` is there to catch it
     import typer
 
     import copem_replay
+    from copem_replay.cli import convert
     from copem_replay.core.errors import CopemError, InputError, OutputError
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
@@ -35,6 +36,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+app.add_typer(convert.app, name="convert")
 
 ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (YAML).")]
 
@@ -51,7 +54,7 @@ def version(
         print(f"copem-replay {installed('copem-replay')}")
         raise typer.Exit(0)
     if context.invoked_subcommand is None:
-        commands = ", ".join(command.callback.__name__ for command in app.registered_commands if command.callback)
+        commands = ", ".join(typer.main.get_group(app).commands)
         raise InputError(f"copem-replay: expected a command, one of {commands}; --help tells more")
 
 

@@ -4,6 +4,7 @@
     ├── InputError            what was given is wrong: one line per problem, exit code 2
     │   ├── ExperimentError   … in an experiment file (file:line: key: …)
     │   └── RecordingError    … in a recording (file: …)
+    │       ├── EgoError
     │       └── EmptyWindowError
     └── OutputError           what was asked for cannot be written, exit code 2
 
@@ -13,6 +14,7 @@ Anything else that escapes is a defect of this project: traceback, exit code 70.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from copem_replay.core.text import printable
 
@@ -38,7 +40,43 @@ class ExperimentError(InputError):
 
 
 class RecordingError(InputError):
-    """A recording cannot be read or replayed."""
+    """A recording cannot be read or replayed.
+
+    Each of `problems` reads `path: topic: reason`. `path`: the file or folder, `topic`: where in it, `reasons`: what is
+    wrong, a line each, without either. `key`: the key of an experiment file that asks in vain, () where none does.
+    """
+
+    _about: str | None = None
+
+    def __init__(
+        self,
+        reasons: str | Sequence[str],
+        *,
+        path: Path | None = None,
+        topic: str | None = None,
+        key: tuple[str | int, ...] = (),
+    ) -> None:
+        self.reasons = (reasons,) if isinstance(reasons, str) else tuple(reasons)
+        self.path, self.topic, self.key = path, topic, key
+        super().__init__(self._lines(path, topic))
+
+    def _lines(self, path: Path | None, topic: str | None) -> list[str]:
+        where = "".join(f"{place}: " for place in (path, topic, self._about) if place is not None)
+        return [f"{where}{reason}" for reason in self.reasons]
+
+    def within(self, path: Path, topic: str | None = None) -> list[str]:
+        """Return the problems without the path and topic that are these, for messages that name them already."""
+        lines = self._lines(None if self.path == path else self.path, None if self.topic == topic else self.topic)
+        return [printable(line) for line in lines]
+
+
+class EgoError(RecordingError):
+    """The ego that is asked for is not in the recording; the line names `ego` as its place."""
+
+    _about = "ego"
+
+    def __init__(self, reasons: str | Sequence[str], *, path: Path) -> None:
+        super().__init__(reasons, path=path, key=("ego",))
 
 
 class EmptyWindowError(RecordingError):

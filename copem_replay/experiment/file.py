@@ -7,13 +7,25 @@ import glob
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from pydantic import ValidationError
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.yaml import AliasesError, Key, NotYamlError, read
 from copem_replay.experiment.schema import Experiment
+
+
+class Problem(str):
+    """What is wrong with a file, in one line that names its place. `line`: which line of the file it names."""
+
+    line: int
+
+    def __new__(cls, text: str, line: int) -> Self:
+        """Return the text with the number of its line."""
+        problem = super().__new__(cls, text)
+        problem.line = line
+        return problem
 
 
 @dataclass(frozen=True)
@@ -37,7 +49,7 @@ class Source:
         if line is None:
             line = next(self.lines[key[:n]] for n in range(len(key), -1, -1) if key[:n] in self.lines)
         name = dotted(key)
-        return f"{self.path}:{line}: {name + ': ' if name else ''}{message}"
+        return Problem(f"{self.path}:{line}: {name + ': ' if name else ''}{message}", line)
 
 
 def dotted(key: Key) -> str:

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from copem_replay.core.errors import EmptyWindowError, RecordingError
-from copem_replay.core.text import unknown
+from copem_replay.core.errors import EgoError, RecordingError
+from copem_replay.core.text import printable, unknown
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, references
-from copem_replay.experiment.file import Source, is_there, log_paths, named_paths, parse
+from copem_replay.experiment.file import Problem, Source, is_there, log_paths, named_paths, parse
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.config import ReadFields
-from copem_replay.io.log import name_of
+from copem_replay.io.open import name_of
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
 from copem_replay.perception.config import Carriers
@@ -40,12 +40,7 @@ def problems(source: Source) -> tuple[Experiment | None, list[str]]:
     experiment, found = parse(source)
     found += references(source)
     found += log_paths(source)[1]
-    return experiment, sorted(found, key=lambda line: _line_number(line, source.path))
-
-
-def _line_number(problem: str, path: Path) -> int:
-    number = problem.removeprefix(f"{path}:").partition(":")[0]
-    return int(number) if number.isdigit() else 0
+    return experiment, sorted(found, key=lambda problem: problem.line if isinstance(problem, Problem) else 0)
 
 
 def place_of(path: Path) -> Path:
@@ -119,15 +114,11 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
     )  # fmt: skip
     try:
         recording = how(ego=ego)
-    except EmptyWindowError as error:
-        return None, [Refused(path, line.removeprefix(f"{path}: "), ("window_s",)) for line in error.problems]
-    except RecordingError as error:
-        reasons = [line.removeprefix(f"{path}: ") for line in error.problems]
-        if not reasons[0].startswith("ego: "):
-            key = ("read", "topic") if "no true objects on topic" in reasons[0] else None
-            return None, [Refused(path, reason, key) for reason in reasons]
-        wrong.append(Refused(path, reasons[0].removeprefix("ego: "), ("ego",)))
+    except EgoError as error:
+        wrong += [Refused(path, printable(reason), error.key) for reason in error.reasons]
         recording = how()  # for what else is wrong
+    except RecordingError as error:
+        return None, [Refused(path, line, error.key or None) for line in error.within(path)]
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
     lists, notes = {}, list(recording.notes)
@@ -137,7 +128,7 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
             notes += said
         except RecordingError as error:
             at = ("units", name, "recorded")
-            wrong += [Refused(path, line.removeprefix(f"{path}: "), at) for line in error.problems]
+            wrong += [Refused(path, line, at) for line in error.within(path)]
     recording = replace(recording, lists=lists, notes=tuple(notes))
     return recording, wrong + [Refused(path, reason, key) for key, reason in against_log(experiment, recording, wrong)]
 

@@ -1,8 +1,8 @@
-"""The containers of recordings: their channels, the payloads of some of them, what can be saved of a damaged file.
+"""A recording that was looked at: its channels, the payloads of some of them, what can be saved of a damaged file.
 
-Here it is MCAP; folders of rosbag2 are in `io/containers/rosbag2.py`, OSI's traces of a single channel in `io/containers/osi_trace.py`. An MCAP file with a
-sound index is read through it. Everything else (no index, an index that lies, a file that was cut off, a checksum that
-fails) is read from start to end, as far as it goes.
+Here it is an MCAP file; other containers (`io/open.py` lists them) derive from it. A file with a sound index is read
+through it. Everything else (no index, an index
+that lies, a file that was cut off, a checksum that fails) is read from start to end, as far as it goes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import io
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -22,26 +22,12 @@ from mcap.stream_reader import CRCValidationError
 from mcap.summary import Summary
 
 from copem_replay.core.errors import RecordingError
+from copem_replay.io.channel import Channel
 from copem_replay.io.containers.mcap_indexed import in_order, summary_of
-from copem_replay.io.containers.mcap_records import DAMAGE, MAGIC, without_trace
+from copem_replay.io.containers.mcap_records import DAMAGE, without_trace
 from copem_replay.io.containers.mcap_recovery import FromStart
 from copem_replay.io.containers.unsupported import check_magic
 from copem_replay.io.window import ALWAYS, Span, Window, kept
-
-
-@dataclass(frozen=True)
-class Channel:
-    """One channel. Two may share a topic: everything is keyed by `number`."""
-
-    number: int
-    topic: str
-    schema: str  # name of the schema, "" without one
-    encoding: str  # of the messages
-    messages: int  # that can be read
-    expected: int | None = None  # of a damaged file: how many its index promises, where that is known
-    schema_encoding: str = ""
-    schema_data: bytes = field(default=b"", repr=False)
-
 
 _READ_AT_ONCE = 1 << 16
 """Bytes (chosen: a call of Python's for as many takes no time beside reading them)."""
@@ -51,8 +37,8 @@ class BrokenIndexError(Exception):
     """An index that seemed sound is not, or what it points at is damaged: `Log.from_start` is the way."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"{path}: the index cannot be used")
-        self.path = path
+        self.path, self.reason = path, "the index cannot be used"
+        super().__init__(f"{path}: {self.reason}")
 
 
 @dataclass(frozen=True)
@@ -130,13 +116,13 @@ class _File(io.FileIO):
         try:
             return super().readinto(buffer)
         except OSError as error:
-            raise RecordingError(f"{self.name}: cannot be read: {error.strerror}") from None
+            raise RecordingError(f"cannot be read: {error.strerror}", path=Path(self.name)) from None
 
     def readall(self) -> bytes:
         try:
             return super().readall()
         except OSError as error:
-            raise RecordingError(f"{self.name}: cannot be read: {error.strerror}") from None
+            raise RecordingError(f"cannot be read: {error.strerror}", path=Path(self.name)) from None
 
 
 def open_file(path: Path) -> IO[bytes]:
@@ -144,41 +130,17 @@ def open_file(path: Path) -> IO[bytes]:
     try:
         return io.BufferedReader(_File(str(path)), _READ_AT_ONCE)
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be opened: {error.strerror}") from None
-
-
-def open_log(path: Path) -> Log:
-    """Look at a recording. Raises RecordingError where it is none, or nothing in it can be read."""
-    if path.is_dir():
-        from copem_replay.io.containers.rosbag2 import open_bag
-
-        return open_bag(path)
-    if is_trace(path):
-        from copem_replay.io.containers.osi_trace import open_trace
-
-        return open_trace(path)
-    return open_mcap(path)
-
-
-def is_trace(path: Path) -> bool:
-    """Whether a file is to be read as OSI's trace of a single channel: by its name, unless it is MCAP all the same."""
-    if path.suffix.lower() != ".osi" or not path.is_file():
-        return False
-    with open_file(path) as file:
-        return file.read(len(MAGIC)) != MAGIC
-
-
-def name_of(path: Path) -> str:
-    """What a log is called: a file without its suffix, a folder as it is."""
-    return path.name if path.is_dir() else path.stem
+        raise RecordingError(f"cannot be opened: {error.strerror}", path=path) from None
 
 
 def open_mcap(path: Path) -> Log:
     """Look at an MCAP file. Raises RecordingError."""
     if not path.exists():
-        raise RecordingError(f"{path}: no such file")
+        raise RecordingError("no such file", path=path)
     if not path.is_file():
-        raise RecordingError(f"{path}: expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}")
+        raise RecordingError(
+            f"expected an MCAP file, found {'a directory' if path.is_dir() else 'a device'}", path=path
+        )
     with open_file(path) as file:
         check_magic(path, file)
         try:
@@ -218,7 +180,7 @@ def from_start(path: Path, index_error: BaseException | None = None, promised: t
         )
     damage = _reason(error) if error else None
     if damage and not sum(counts.values()):
-        raise RecordingError(f"{path}: damaged, and no message can be read ({damage})")
+        raise RecordingError(f"damaged, and no message can be read ({damage})", path=path)
     if damage and stream.complete:
         damage = f"its index cannot be used ({damage}): read from start to end, no message is lost"
     return Log(

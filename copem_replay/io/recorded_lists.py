@@ -15,15 +15,18 @@ import numpy as np
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Bool, Float, Int, Scene
-from copem_replay.io import log as container
+from copem_replay.io.channel import schema_name
 from copem_replay.io.encodings.columns import take_apart
+from copem_replay.io.encodings.definition import definition_of
 from copem_replay.io.encodings.raw_values import DefinitionError
+from copem_replay.io.log import BrokenIndexError, Log
+from copem_replay.io.open import open_log
 from copem_replay.io.recorded_osi import RecordedLists, as_tracks
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.object_lists import Listed
-from copem_replay.io.schemas.registry import definition_of, schema_name
+from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.window import Window
-from copem_replay.io.world_frame import Surroundings, gathered, in_world, known_lists, lists_of, surroundings
+from copem_replay.io.world_frame import Surroundings, gathered, in_world, lists_of, surroundings
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write.ros2_definitions import STRING
 
@@ -33,26 +36,26 @@ def read_listed(
     path: Path, topic: str, scene: Scene, around: Surroundings | None, window: Window | None = None
 ) -> RecordedLists | None:
     """The lists on `topic`, in the world of the truth; None: none of a known format is there. Raises RecordingError."""
-    log = container.open_log(path).within(window)
+    log = open_log(path).within(window)
     try:
         return _read(log, topic, scene, around)
-    except container.BrokenIndexError as error:
+    except BrokenIndexError as error:
         return _read(log.from_start(error), topic, scene, around)
 
 
-def _read(log: container.Log, topic: str, scene: Scene, around: Surroundings | None) -> RecordedLists | None:
-    channels = [c for c in known_lists(log) if c.topic == topic]
+def _read(log: Log, topic: str, scene: Scene, around: Surroundings | None) -> RecordedLists | None:
+    channels = [c for c in known_lists(log.channels) if c.topic == topic]
     if not channels:
         return None
     mine = [c for c in channels if c.schema == channels[0].schema]
     if log.window is not None and next(log.payloads(frozenset(c.number for c in mine)), None) is None:
-        raise RecordingError(f"{log.path}: {topic}: holds no list in the window")
+        raise RecordingError("holds no list in the window", path=log.path, topic=topic)
     around = around or surroundings(log, None, seek_ego=False)
-    found = in_world(lists_of(log, mine, None), around, f"{log.path}: {topic}")
+    found = in_world(lists_of(log, mine, None), around, log.path, topic)
     return _recorded(found, _details(log, topic), topic, scene)
 
 
-def _details(log: container.Log, topic: str) -> dict[int, dict[str, Any]]:
+def _details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
     """What is beside the lists on a topic, by the time at which each was available."""
     beside = f"{topic.removesuffix('/objects')}/detail"
     channels = [c for c in log.channels if c.topic == beside and c.messages and schema_name(c) == STRING]

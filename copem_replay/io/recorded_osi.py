@@ -17,9 +17,11 @@ from google.protobuf.message import DecodeError
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.io import log as container
+from copem_replay.io.log import BrokenIndexError, Log
+from copem_replay.io.open import open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import LAST_NS
+from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write import osi_sensor_data as sensor_data
@@ -111,18 +113,18 @@ def read_recorded(path: Path, topic: str, scene: Scene, window: Window | None = 
 
 
 def _all_rows(path: Path, topic: str, window: Window | None = None) -> tuple[_Rows, dict[int, dict[str, Any]]]:
-    log = container.open_log(path).within(window)
+    log = open_log(path).within(window)
     try:
         return _read(log, topic)
-    except container.BrokenIndexError as error:
+    except BrokenIndexError as error:
         return _read(log.from_start(error), topic)
 
 
-def _no_lists(log: container.Log, topic: str) -> str:
+def _no_lists(log: Log, topic: str) -> str:
     """That a topic holds no lists of a unit, and which ones do."""
-    from copem_replay.io.world_frame import known_lists
-
-    there = {c.topic for c in log.channels if c.schema == sensor_data.SCHEMA} | {c.topic for c in known_lists(log)}
+    there = {c.topic for c in log.channels if c.schema == sensor_data.SCHEMA} | {
+        c.topic for c in known_lists(log.channels)
+    }
     schemas = sorted({c.schema or "no schema" for c in log.channels if c.topic == topic})
     found = f"topic {topic!r} holds {', '.join(schemas)}" if schemas else f"no topic {topic!r}"
     if not there:
@@ -130,10 +132,10 @@ def _no_lists(log: container.Log, topic: str) -> str:
     return f"{found}; lists of units are on {', '.join(sorted(there))}"
 
 
-def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
+def _read(log: Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == sensor_data.SCHEMA}
     if not chosen:
-        raise RecordingError(f"{log.path}: {_no_lists(log, topic)}")
+        raise RecordingError(_no_lists(log, topic), path=log.path)
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == detail.SCHEMA}
     rows = _Rows()
@@ -146,10 +148,10 @@ def _read(log: container.Log, topic: str) -> tuple[_Rows, dict[int, dict[str, An
             try:
                 message = sensor_data.message_class().FromString(payload)
             except DecodeError as error:
-                raise RecordingError(f"{log.path}: {topic}: a message cannot be decoded: {error}") from None
+                raise RecordingError(f"a message cannot be decoded: {error}", path=log.path, topic=topic) from None
             _add(rows, message, log_time_ns)
             if max(map(abs, rows.stamps[-1])) > LAST_NS:
-                raise RecordingError(f"{log.path}: {topic}: a message has an impossible time stamp")
+                raise RecordingError("a message has an impossible time stamp", path=log.path, topic=topic)
     return rows, details
 
 

@@ -72,12 +72,14 @@ def recorded_unit(recording: Recording, name: str, asked: Recorded) -> tuple[Rec
     found = found or read_recorded(path, asked.topic, scene, window)
     tracks = found.tracks
     if not len(tracks.stamp_ns):
-        raise RecordingError(f"{path}: {asked.topic}: holds no list{' in the window' if window else ''}")
+        raise RecordingError(f"holds no list{' in the window' if window else ''}", path=path, topic=asked.topic)
     unsaid = ~found.spread_said
     if unsaid.any() and asked.covariance_m2 is None:
         raise RecordingError(
-            f"{path}: {asked.topic}: {unsaid.sum()} of {counted(len(unsaid), 'entry', 'entries')} say nothing of their "
-            "covariance; give `covariance_m2`"
+            f"{unsaid.sum()} of {counted(len(unsaid), 'entry', 'entries')} say nothing of their "
+            "covariance; give `covariance_m2`",
+            path=path,
+            topic=asked.topic,
         )
     notes = [f"unit {name}: {found.dropped} of its entries have no position and are left out"] if found.dropped else []
     columns: dict[str, Any] = {}

@@ -13,14 +13,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.errors import RecordingError
+from copem_replay.core.errors import EgoError, RecordingError
 from copem_replay.core.text import counted, printable
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
-from copem_replay.io import log as container
+from copem_replay.io.channel import Channel
 from copem_replay.io.ground_truth import assemble
-from copem_replay.io.log import Channel, Log
+from copem_replay.io.log import BrokenIndexError, Log
+from copem_replay.io.open import open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import Columns
+from copem_replay.io.schemas.pose_schemas import is_pose
+from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
 from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
 
 if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
@@ -29,6 +32,7 @@ if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not
     from copem_replay.io.schemas.object_lists import Fields
     from copem_replay.io.world_frame import Surroundings
 
+_TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
 _SHOWN = 12  # ids or topics named in an error (chosen)
 
 
@@ -75,7 +79,7 @@ def read(
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several; EmptyWindowError.
     """
-    log = container.open_log(Path(path))
+    log = open_log(Path(path))
     return read_log(log, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
 
 
@@ -96,7 +100,7 @@ def read_log(
     try:
         log = cut_out(log, topic, window_s)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
-    except container.BrokenIndexError as error:
+    except BrokenIndexError as error:
         log = cut_out(log.from_start(error), topic, window_s)
         columns, around, world = _columns(log, topic, fields, asked, seek_ego=ego is None)
     scene, truth, found = assemble(columns, name)
@@ -106,7 +110,7 @@ def read_log(
         inside = "the window" if log.window is not None else messages
         damage = _damage(log, topic, None)
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
-        raise RecordingError(f"{log.path}: {topic}: no usable object in {inside}{why}")
+        raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
     host, said = _host(columns.hosts)
     ego_ix, more = _ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _damage(log, topic, scene.end_s)
@@ -134,10 +138,7 @@ def truth_topics(log: Log) -> dict[str, str]:
     ours = {c.topic for c in log.channels if c.topic.startswith("copem/")}
     if osis or not foreign(log):
         return osis
-    from copem_replay.io.schemas.registry import names_objects
-    from copem_replay.io.world_frame import known_lists
-
-    others = {c.topic: c.schema for c in known_lists(log) if names_objects(c)}
+    others = {c.topic: c.schema for c in known_lists(log.channels) if names_objects(c)}
     return {t: schema for t, schema in others.items() if t not in ours} or others
 
 
@@ -155,29 +156,32 @@ def choose_topic(
 ) -> tuple[str, list[str]]:
     """Find the topic of the truth, and notes. Raises RecordingError: there is none, or a choice to make."""
     if not any(c.messages for c in log.channels):
-        raise RecordingError(f"{log.path}: holds no message ({_listed(log.channels) or 'and no channel'})")
+        raise RecordingError(f"holds no message ({_listed(log.channels) or 'and no channel'})", path=log.path)
     topics = truth_topics(log)
     if topic is not None and foreign(log):
-        from copem_replay.io.world_frame import known_lists
-
-        topics |= {c.topic: c.schema for c in known_lists(log) if c.topic == topic}
+        topics |= {c.topic: c.schema for c in known_lists(log.channels) if c.topic == topic}
     if fields is not None:
         topics = {c.topic: c.schema for c in log.channels if c.messages}
         if topic not in topics:
-            raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; messages are on {_named(topics)}")
+            raise RecordingError(
+                f"no true objects on topic {topic!r}; messages are on {_named(topics)}", path=log.path, key=_TOPIC
+            )
         return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
     if not topics:
         raise RecordingError(
-            f"{log.path}: no list of true objects; it holds {_listed(log.channels)}; "
-            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
+            f"no list of true objects; it holds {_listed(log.channels)}; "
+            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)",
+            path=log.path,
         )
     if topic is not None and topic not in topics:
-        raise RecordingError(f"{log.path}: no true objects on topic {topic!r}; they are on {_named(topics)}")
+        raise RecordingError(
+            f"no true objects on topic {topic!r}; they are on {_named(topics)}", path=log.path, key=_TOPIC
+        )
     chosen = topic if topic is not None else _only(topics)
     if chosen is None:
         raise RecordingError(
-            f"{log.path}: true objects on several topics, {_named(topics)}: "
-            "choose one with `read: {topic: …}` in the experiment"
+            f"true objects on several topics, {_named(topics)}: choose one with `read: {{topic: …}}` in the experiment",
+            path=log.path,
         )
     poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
     return chosen, _ignored(log, chosen, topics, beside, poses_read=poses_read)
@@ -196,8 +200,6 @@ def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[s
     skipped = Counter[str]()
     poses: set[int] = set()
     if poses_read and (others := foreign(log)):
-        from copem_replay.io.schemas.poses import is_pose
-
         poses = {c.number for c in others if is_pose(c)}
     for channel in log.channels:
         there = channel.messages and channel.number not in poses
@@ -215,12 +217,12 @@ def _columns(
     """All that is on a topic, in the world, and the ego; the world's name. Raises RecordingError, BrokenIndexError."""
     channels = [c for c in log.channels if c.topic == topic and c.messages]
     if fields is None and any(not is_truth(c) for c in channels):  # channels of one topic may be of several schemas
-        from copem_replay.io.schemas.registry import is_list, names_objects
-
         channels = [c for c in channels if is_truth(c) or is_list(c)]
         channels.sort(key=lambda c: not names_objects(c))
     if not channels:
-        raise RecordingError(f"{log.path}: {topic}: no message can be read{f' ({log.damage})' if log.damage else ''}")
+        raise RecordingError(
+            f"no message can be read{f' ({log.damage})' if log.damage else ''}", path=log.path, topic=topic
+        )
     if fields is None and any(is_truth(c) for c in channels):
         columns = _decode(log, topic)
         if asked is None:
@@ -229,7 +231,6 @@ def _columns(
 
         around = surroundings(log, asked, seek_ego=False)
         return _with_notes(with_ego(columns, around), around), around, ""
-    from copem_replay.io.schemas.registry import names_objects
     from copem_replay.io.world_frame import in_world, lists_of, surroundings, with_ego
 
     around = surroundings(log, asked, seek_ego=seek_ego)
@@ -237,10 +238,10 @@ def _columns(
     found = lists_of(log, mine, fields)
     if (fields is None and not names_objects(mine[0])) or (fields is not None and fields.id is None):
         raise RecordingError(
-            f"{log.path}: {topic}: its objects have no ids; lists of a unit they can be, not the truth"
+            "its objects have no ids; lists of a unit they can be, not the truth", path=log.path, topic=topic
         )
     world = around.world_of(found)
-    found = in_world(found, around, f"{log.path}: {topic}")
+    found = in_world(found, around, log.path, topic)
     return _with_notes(with_ego(found.columns, around), around), around, world
 
 
@@ -291,7 +292,7 @@ def _ego(path: Path, scene: Scene, ego: str | None, host: str | None) -> tuple[i
     if index >= 0 and scene.moving[index]:
         return index, []
     if ego is not None:
-        raise RecordingError(f"{path}: ego: no moving object {ego!r}; there are {moving_ids(scene)}")
+        raise EgoError(f"no moving object {ego!r}; there are {moving_ids(scene)}", path=path)
     if host is not None:
         return -1, [f"the host vehicle {host} is not among the moving objects: no ego vehicle"]
     return -1, []

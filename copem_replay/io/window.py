@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import EmptyWindowError
+from copem_replay.io.channel import Channel
+from copem_replay.io.schemas.pose_schemas import is_pose
 
 if TYPE_CHECKING:
-    from copem_replay.io.log import Channel, Log
+    from copem_replay.io.log import Log
 
 Span = tuple[int, int]
 """First and last log time in ns, both included."""
@@ -32,8 +34,6 @@ class Window:
 
     def span(self, channel: Channel) -> Span:
         """What is read of a channel: poses with a margin, static transforms wholly."""
-        from copem_replay.io.schemas.poses import is_pose
-
         if not is_pose(channel):
             return self.from_ns, self.to_ns
         if channel.topic.endswith("tf_static"):
@@ -73,8 +73,10 @@ def cut_out(log: Log, topic: str, window_s: WindowSeconds) -> Log:
     if next(cut.payloads(numbers), None) is None:
         span_s = (_last_ns(log, numbers) - first_ns) * 1e-9
         raise EmptyWindowError(
-            f"{log.path}: {topic}: no message in the window {in_words(from_s, to_s)}; there are some from 0 to "
-            f"{span_s:.10g} s"
+            f"no message in the window {in_words(from_s, to_s)}; there are some from 0 to {span_s:.10g} s",
+            path=log.path,
+            topic=topic,
+            key=("window_s",),
         )
     return cut
 

@@ -8,20 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.errors import RecordingError
+from copem_replay.core.errors import EgoError, RecordingError
 from copem_replay.core.rotation import turned, yaw_of
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, VALUES, Float
+from copem_replay.io.channel import Channel, schema_name
+from copem_replay.io.encodings.definition import definition_of
 from copem_replay.io.encodings.raw_values import DefinitionError
-from copem_replay.io.log import Channel, Log
+from copem_replay.io.log import Log
 from copem_replay.io.schemas.decoded import LAST_NS, Columns
 from copem_replay.io.schemas.object_lists import Description, Fields, FieldsError, Listed, listed
-from copem_replay.io.schemas.poses import ODOMETRY, Poses, is_pose, poses_of
-from copem_replay.io.schemas.registry import definition_of, description_of, is_list, schema_name
+from copem_replay.io.schemas.pose_schemas import ODOMETRY, is_pose
+from copem_replay.io.schemas.poses import Poses, poses_of
+from copem_replay.io.schemas.registry import description_of
 from copem_replay.io.transforms import Course, Frames, course_of
 
 if TYPE_CHECKING:
@@ -106,7 +110,7 @@ def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroun
         frames.add(poses, static=channel.topic.endswith("tf_static"))
     chosen = _ego_channel(log, channels, asked, seek_ego)
     if chosen is not None and not found.payloads[chosen.number]:
-        raise RecordingError(f"{log.path}: ego: no pose on topic {chosen.topic!r}{_there(log)}")
+        raise EgoError(f"no pose on topic {chosen.topic!r}{_there(log)}", path=log.path)
     if chosen is None or chosen.number not in of_channel:
         return Surroundings(frames, None, asked, tuple(notes))
     poses = of_channel[chosen.number]
@@ -114,14 +118,14 @@ def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroun
     picked = None if child is None else np.array([name == child.lstrip("/") for name in poses.child], dtype=bool)
     children = sorted(set(poses.child))
     if picked is None and len(children) > 1:
-        raise RecordingError(
-            f"{log.path}: ego: {chosen.topic} has poses of several frames; choose with `frame`: "
-            f"{', '.join(children[:_SHOWN])}"
+        raise EgoError(
+            f"{chosen.topic} has poses of several frames; choose with `frame`: {', '.join(children[:_SHOWN])}",
+            path=log.path,
         )
     course = course_of(poses, picked)
     if course is None:
         of = f" of frame {child!r}" if child else ""
-        raise RecordingError(f"{log.path}: ego: no pose on topic {chosen.topic!r}{of}{_there(log)}")
+        raise EgoError(f"no pose on topic {chosen.topic!r}{of}{_there(log)}", path=log.path)
     return Surroundings(frames, course, asked, (*notes, *_on_ego(chosen, asked)))
 
 
@@ -141,7 +145,7 @@ def _ego_channel(log: Log, channels: Sequence[Channel], asked: EgoTopic | None, 
         mine = [c for c in channels if c.topic == asked.topic]
         if not mine:
             there = ", ".join(f"{c.topic} ({c.schema})" for c in channels) or "none"
-            raise RecordingError(f"{log.path}: ego: no poses on topic {asked.topic!r}; poses are on: {there}")
+            raise EgoError(f"no poses on topic {asked.topic!r}; poses are on: {there}", path=log.path)
         return mine[0]
     odometry = [c for c in channels if schema_name(c) == ODOMETRY]
     return odometry[0] if seek_ego and len(odometry) == 1 else None
@@ -171,14 +175,14 @@ def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> Li
         description = Description(fields) if fields is not None else description_of(channel, definition.offers())
         lists = listed(definition, description, payloads, times)
     except (DefinitionError, FieldsError) as error:
-        raise RecordingError(f"{log.path}: {channel.topic}: {error}") from None
+        raise RecordingError(str(error), path=log.path, topic=channel.topic) from None
     return replace(lists, columns=replace(lists.columns, notes=(*lists.columns.notes, *found.notes())))
 
 
-def in_world(found: Listed, around: Surroundings, place: str) -> Listed:
+def in_world(found: Listed, around: Surroundings, path: Path, topic: str) -> Listed:
     """The same lists in the world; states at instants at which their frame is nowhere are left out, and said.
 
-    Raises RecordingError, naming `place`, where the recording does not say how frames lie to each other.
+    Raises RecordingError, naming `path` and `topic`, where the recording does not say how frames lie to each other.
     """
     names = [name.lstrip("/") for name in found.frames]
     if not len(found.frame_code) or not names:
@@ -196,8 +200,10 @@ def in_world(found: Listed, around: Surroundings, place: str) -> Listed:
         placed = around.frames.place(name, world, stamps)
         if placed is None:
             raise RecordingError(
-                f"{place}: lists are in the frame {name!r}, the ego in {world!r}, and no transform of the recording "
-                "says how they lie"
+                f"lists are in the frame {name!r}, the ego in {world!r}, and no transform of the recording "
+                "says how they lie",
+                path=path,
+                topic=topic,
             )
         values[rows, _X : _Z + 1] = turned(placed.rotation[back], values[rows, _X : _Z + 1]) + placed.position_m[back]
         yaw = yaw_of(placed.rotation)[back]
@@ -272,8 +278,3 @@ def with_ego(columns: Columns, around: Surroundings) -> Columns:
 
 def _stacked(first: Float, second: Float) -> Float:
     return np.concatenate([first, second])
-
-
-def known_lists(log: Log) -> list[Channel]:
-    """Channels of object lists that are known by their schemas, OSI aside, and hold messages."""
-    return [c for c in log.channels if is_list(c) and c.messages]

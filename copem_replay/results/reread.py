@@ -23,7 +23,7 @@ def reread(results: Results, log: str, object_id: str) -> Replay:
     experiment = results.experiment.model_copy(update={"measure": measure})
     recording = read_again(results, log, experiment)
     if recording.scene.ego_ix < 0:
-        raise RecordingError(f"{recording.path}: no ego in this study, whose runs could be drawn")
+        raise RecordingError("no ego in this study, whose runs could be drawn", path=recording.path)
     return prepare(recording, experiment)
 
 
@@ -39,8 +39,9 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
         raise RecordingError(f"{error}; put the log back to draw its runs") from None
     if found != file.sha256:
         raise RecordingError(
-            f"{file.path}: expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {found[:12]}…; "
-            "put that log back, or run the experiment again"
+            f"expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {found[:12]}…; "
+            "put that log back, or run the experiment again",
+            path=file.path,
         )
     recordings, refused = read_logs(experiment, [file.path], results.source)
     if refused:

@@ -271,6 +271,12 @@ class TestOneLog:
         (found,) = against_logs(tmp_path, TEXT + "read: {topic: c}\n")
         assert found.startswith("19: read.topic: drive.mcap: no true objects on topic 'c'; they are on a (")
 
+    def test_a_topic_of_any_name_is_no_key(self, tmp_path: Path) -> None:
+        for name in ("ego", "no true objects on topic"):
+            write_mcap(tmp_path / "drive.mcap", [truth_topic([(0, [Obj(x=None)])], name=name)])
+            (found,) = against_logs(tmp_path, TEXT + "ego: 1\n")
+            assert found.startswith(f"drive.mcap: {name}: no usable object")
+
 
 class TestUnreadableLogs:
     def test_absent(self, tmp_path: Path) -> None:

@@ -6,20 +6,25 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
 
+from copem_replay.cli import main as cli
 from copem_replay.core.tracks import CLASSES
+from copem_replay.io.convert.ground_truth import RECORD
 from copem_replay.io.recording import Recording, read
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
 
-import convert  # noqa: E402
-from converters.trace import RECORD  # noqa: E402
+
+def convert(*words: str | Path) -> int:
+    """Run `copem-replay convert` in this process; the exit code."""
+    with patch.object(sys, "argv", ["copem-replay", "convert", *map(str, words)]):
+        return cli._ended()
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class Runner:
         return path
 
     def __call__(self, kind: str, source: Path, *options: str | Path) -> Converted:
-        status = convert.main([kind, str(source), str(self.output), "--overwrite", *map(str, options)])
+        status = convert(kind, source, "--out", self.output, "--overwrite", *options)
         printed = self.capsys.readouterr()
         assert (status, printed.err) == (0, "")
         with self.output.open("rb") as stream:
@@ -88,7 +93,7 @@ class Runner:
     def refused(self, kind: str, source: Path, *options: str | Path) -> str:
         """Return the one line on stderr."""
         self.output.unlink(missing_ok=True)
-        status = convert.main([kind, str(source), str(self.output), *map(str, options)])
+        status = convert(kind, source, "--out", self.output, *options)
         printed = self.capsys.readouterr()
         assert (status, printed.out) == (2, "")
         assert not self.output.parent.exists() or not list(self.output.parent.iterdir())

@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 from osi3.osi_object_pb2 import MovingObject
 
+from copem_replay.cli import convert as convert_command
 from copem_replay.experiment.draft.survey import survey
 from tests.helpers.conversions import ROOT, Runner, convert, run
 
@@ -34,40 +36,53 @@ def test_the_file_is_whole_the_same_again_and_read_by_info(run: Runner) -> None:
 
 
 def test_it_runs_as_a_command(tmp_path: Path) -> None:
-    tool = [sys.executable, str(ROOT / "tools" / "convert.py")]
+    command = [sys.executable, "-c", "from copem_replay.cli.main import main; main()"]
     source = tmp_path / "table.csv"
     source.write_text(f"{HEADER}\n{CAR}\n")
-    done = subprocess.run([*tool, "csv", source, tmp_path / "a.mcap"], capture_output=True, text=True, check=True)
+    words = ["convert", "csv", source, "--out", tmp_path / "a.mcap"]
+    done = subprocess.run([*command, *words], capture_output=True, text=True, check=True)
     assert done.stdout.startswith(f"{tmp_path / 'a.mcap'}: 1 frame, 1 car\nnote: 1 row without height_m")
-    main = "from copem_replay.cli.main import main; main()"
-    shown = subprocess.run(
-        [sys.executable, "-c", main, "info", tmp_path / "a.mcap"], capture_output=True, text=True, check=True
-    )
+    shown = subprocess.run([*command, "info", tmp_path / "a.mcap"], capture_output=True, text=True, check=True)
     assert "moving: 1 car" in shown.stdout
 
 
 def test_a_wrong_command_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for words, what in (
-        (["nuscenes", "a", "b.mcap"], "invalid choice: 'nuscenes'"),
-        ([], "required: FORMAT"),
-        (["csv", "a"], "required: OUTPUT.mcap"),
-        (["openlabel", "a", "b.mcap", "--rate-hz", "0"], "expected a number above 0, found '0'"),
+        (["nuscenes", "a", "--out", "b.mcap"], "No such command 'nuscenes'"),
+        ([], "expected a format, one of argoverse2, scenarionet, openlabel, commonroad, sumo, csv"),
+        (["csv", "a"], "Missing option '--out'"),
+        (["openlabel", "a", "--out", "b.mcap", "--rate-hz", "0"], "--rate-hz: expected a number above 0, found 0"),
+        (["scenarionet", "a", "--out", "b.mcap", "--ego-centre-m", "nan"], "--ego-centre-m: expected a number, found"),
     ):
-        with pytest.raises(SystemExit) as ended:
-            convert.main(words)
-        assert ended.value.code == 2
+        assert convert(*words) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert what in line
+
+
+def test_every_format_has_a_command_and_its_help_says_the_defaults() -> None:
+    from copem_replay.io.convert import argoverse2, scenarionet
+    from copem_replay.io.convert.conversion import FORMATS
+
+    commands = typer.main.get_group(convert_command.app).commands
+    assert list(commands) == list(FORMATS)
+
+    def default(command: str, option: str) -> list[float]:
+        (found,) = [p.help for p in commands[command].params if p.name == option]
+        return [float(number) for number in re.findall(r"\d+\.?\d*", found)]
+
+    assert default("argoverse2", "ego_size_m") == list(argoverse2.EGO_SIZE_M)
+    assert default("argoverse2", "centre_from_rear_axle_m") == list(argoverse2.CENTRE_FROM_REAR_AXLE_M)
+    assert default("scenarionet", "ego_centre_m") == [scenarionet.EGO_CENTRE_M, 0]
 
 
 def test_input_and_output_are_checked_first(run: Runner, capsys: pytest.CaptureFixture[str]) -> None:
     source = run.file("table.csv", f"{HEADER}\n{CAR}\n")
     assert "no such file or folder" in run.refused("csv", run.folder / "none.csv")
-    assert convert.main(["csv", str(source), str(source)]) == 2  # swapped or forgotten: it would be overwritten
+    assert convert("csv", source, "--out", source) == 2  # swapped or forgotten: it would be overwritten
     assert "expected an output that ends in .mcap, found 'table.csv'" in capsys.readouterr().err
     assert source.read_text().startswith(HEADER)
     (run.folder / "folder.mcap").mkdir()
-    assert convert.main(["csv", str(source), str(run.folder / "folder.mcap")]) == 2
+    assert convert("csv", source, "--out", run.folder / "folder.mcap") == 2
     assert "folder.mcap: cannot be written: Is a directory" in capsys.readouterr().err
     assert "cannot be opened: Is a directory" in run.refused("csv", run.folder)
 
@@ -78,7 +93,7 @@ def test_a_failure_midway_leaves_the_old_file_alone(run: Runner) -> None:
     bad = run.file("bad.xml", f"<fcd-export>{step.format(0)}{step.format(0)}</fcd-export>")
     run("sumo", good)
     before = run.output.read_bytes()
-    assert convert.main(["sumo", str(bad), str(run.output), "--overwrite"]) == 2
+    assert convert("sumo", bad, "--out", run.output, "--overwrite") == 2
     assert run.output.read_bytes() == before
     assert list(run.output.parent.iterdir()) == [run.output]
 
@@ -88,11 +103,11 @@ def test_what_is_there_already_is_replaced_only_when_that_is_asked_for(
 ) -> None:
     source = run.file("table.csv", f"{HEADER}\n{CAR}\n")
     there = run.file("there.mcap", "of another day")
-    words = ["csv", str(source), str(there)]
-    assert convert.main(words) == 2
+    words = ["csv", source, "--out", there]
+    assert convert(*words) == 2
     assert capsys.readouterr().err == f"{there}: is there already; give another name, or --overwrite\n"
     assert there.read_text() == "of another day"
-    assert convert.main([*words, "--overwrite"]) == 0
+    assert convert(*words, "--overwrite") == 0
     assert survey(there)["readable"]
     assert sorted(path.name for path in run.folder.iterdir()) == ["table.csv", "there.mcap"]
 
@@ -173,14 +188,16 @@ def test_csv_of_another_encoding(run: Runner) -> None:
 
 
 def test_the_page_shows_commands_that_are_understood_and_a_table_that_converts(run: Runner) -> None:
-    from converters import csv_rows
-    from converters.kinds import KINDS
+    from copem_replay.io.convert import csv_rows
+    from copem_replay.io.convert.kinds import KINDS
 
+    group = typer.main.get_group(convert_command.app)
     page = (ROOT / "docs" / "converters.md").read_text(encoding="utf-8")
-    commands = re.findall(r"`python tools/convert\.py (.*?)`", page)
+    commands = re.findall(r"`copem-replay convert (.*?)`", page)
     assert len(commands) == 8
     for command in commands:
-        convert.parser().parse_args(shlex.split(command))
+        name, *words = shlex.split(command)
+        group.commands[name].make_context(name, words)  # raises where an option is unknown or missing
     (table,) = re.findall(r"```csv\n(.*?)```", page, re.DOTALL)
     found = run("csv", run.file("table.csv", table))
     assert found.names == {"1": "ego", "2": "anna"}
@@ -303,8 +320,8 @@ def test_xml_with_entities_is_refused(run: Runner, kind: str) -> None:
 
 
 def test_sumo_is_read_time_step_by_time_step(run: Runner) -> None:
-    from converters.sumo import frames
-    from converters.trace import Report
+    from copem_replay.io.convert.ground_truth import Report
+    from copem_replay.io.convert.sumo import frames
 
     step = '<vehicle id="a" x="1" y="0" angle="90"/>' + " " * 70_000  # each more than a block
     source = run.file("f.xml", fcd(step, step)[: -len("</timestep></fcd-export>")])
@@ -462,8 +479,8 @@ def test_commonroad_refuses(run: Runner, text: str, line: str) -> None:
 
 
 def test_every_kind_is_of_the_class_its_name_says() -> None:
-    from converters.kinds import KINDS
     from copem_replay.core.tracks import CLASSES
+    from copem_replay.io.convert.kinds import KINDS
     from copem_replay.io.schemas.osi_ground_truth import class_of
 
     found = {name: CLASSES[class_of(kind.type, kind.vehicle)] for name, kind in KINDS.items() if kind.moving}

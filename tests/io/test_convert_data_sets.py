@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 from osi3.osi_object_pb2 import StationaryObject
 
-from converters import restricted_pickle
 from copem_replay.core.errors import InputError
+from copem_replay.io.convert import restricted_pickle
 from copem_replay.io.recording import read
 from tests.helpers.conversions import Runner, convert, run
 
@@ -105,8 +105,8 @@ def test_argoverse2_ego_of_another_size(run: Runner) -> None:
 
 
 def test_argoverse2_every_category_of_the_data_set_is_known() -> None:
-    from converters.argoverse2 import _KIND
-    from converters.kinds import KINDS
+    from copem_replay.io.convert.argoverse2 import _KIND
+    from copem_replay.io.convert.kinds import KINDS
 
     assert len(_KIND) == 30  # AnnotationCategories of av2-api
     static = {name for name, kind in _KIND.items() if not KINDS[kind].moving}
@@ -286,8 +286,8 @@ def test_scenarionet_whole_folder(run: Runner, capsys: pytest.CaptureFixture[str
     run.file("w/w_0/dataset_mapping.pkl", pickle.dumps({"sd_waymo_a.pkl": ""}))
     run.file("w/dataset_mapping.pkl", pickle.dumps({"sd_waymo_b.pkl": "w_1", "sd_waymo_a.pkl": "w_0"}))
     out = run.folder / "out"
-    words = ["scenarionet", str(run.folder / "w"), str(out)]
-    assert convert.main(words) == 0
+    words = ["scenarionet", run.folder / "w", "--out", out]
+    assert convert(*words) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[:2] == [f"{out / f'sd_waymo_{name}.mcap'}: 4 frames, 1 car" for name in "ab"]
     assert "note: 8 states of the ego vehicle with length and width swapped (1.73×4.08 m): put right" in printed
@@ -295,11 +295,11 @@ def test_scenarionet_whole_folder(run: Runner, capsys: pytest.CaptureFixture[str
     assert read(out / "sd_waymo_b.mcap", name="b").host_id == "1"
     # The same again is refused before anything is read, and done with --overwrite, to the same bytes.
     before = (out / "sd_waymo_a.mcap").read_bytes()
-    assert convert.main(words) == 2
+    assert convert(*words) == 2
     assert capsys.readouterr().err == (
         f"{out / 'sd_waymo_a.mcap'}: is there already, and 1 other; give another name, or --overwrite\n"
     )
-    assert convert.main([*words, "--overwrite"]) == 0
+    assert convert(*words, "--overwrite") == 0
     assert (out / "sd_waymo_a.mcap").read_bytes() == before
 
 
@@ -310,7 +310,7 @@ def test_scenarionet_folder_without_a_mapping_and_with_one_that_is_none(
     run.file("w/sd_b.pkl", b"nothing")
     run.file("w/0.pkl", pickle.dumps(counting(sdc_id=None)))
     out = run.folder / "out"
-    assert convert.main(["scenarionet", str(run.folder / "w"), str(out)]) == 2
+    assert convert("scenarionet", run.folder / "w", "--out", out) == 2
     printed = capsys.readouterr()
     first, last = printed.err.splitlines()
     assert first.startswith(f"{run.folder / 'w' / 'sd_b.pkl'}: expected a pickle, found something else")
@@ -320,7 +320,7 @@ def test_scenarionet_folder_without_a_mapping_and_with_one_that_is_none(
     assert sorted(path.name for path in out.iterdir()) == ["0.mcap", "sd_a.mcap"]
     # Where nothing can be written, all is said once.
     place = run.file("place", "") / "out"
-    assert convert.main(["scenarionet", str(run.folder / "w"), str(place)]) == 2
+    assert convert("scenarionet", run.folder / "w", "--out", place) == 2
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith(f"{place / '0.mcap'}: cannot be written: ")
     assert last == "3 of 3 scenarios not converted"
@@ -330,7 +330,7 @@ def test_scenarionet_folders_that_are_refused(run: Runner, capsys: pytest.Captur
     out = run.folder / "out"
 
     def line(folder: str, output: Path = out) -> str:
-        assert convert.main(["scenarionet", str(run.folder / folder), str(output)]) == 2
+        assert convert("scenarionet", run.folder / folder, "--out", output) == 2
         assert not out.exists()
         (found,) = capsys.readouterr().err.splitlines()
         return str(found)
@@ -509,7 +509,7 @@ def test_a_pickle_cannot_ask_for_gigabytes(tmp_path: Path, program: bytes, what:
 
 def test_scenarionet_arrays_of_nothing_in_any_shape(run: Runner) -> None:
     huge = np.lib.stride_tricks.as_strided(np.zeros(1), shape=(10**11,), strides=(0,))
-    from converters.scenarionet import _array, _stamps
+    from copem_replay.io.convert.scenarionet import _array, _stamps
 
     with pytest.raises(InputError, match="ts: expected times in seconds"):
         _stamps({"ts": huge}, "m")

@@ -9,7 +9,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
 from copem_replay.core.errors import RecordingError
-from copem_replay.io import log as container
+from copem_replay.io import log
+from copem_replay.io.containers.mcap_records import MAGIC
+from copem_replay.io.open import open_log
 from copem_replay.io.recording import Recording, read
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap, write_recording
 
@@ -114,7 +116,7 @@ def test_another_format_says_what_it_begins_with(path, name, content, found):
 
 
 def test_nothing_but_the_magic(path):
-    path.write_bytes(container.MAGIC)
+    path.write_bytes(MAGIC)
     assert problem(path) == f"damaged, and no message can be read ({CUT_OFF})"
 
 
@@ -124,7 +126,7 @@ def test_file_without_permission_to_read(path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(container, "_File", refuse)
+    monkeypatch.setattr(log, "_File", refuse)
     assert problem(path) == "cannot be opened: Permission denied"
 
 
@@ -179,7 +181,7 @@ def test_all_kinds_of_files_read_the_same_and_need_no_note(path, options):
 def test_channels_of_one_topic_and_of_one_schema_name_are_kept_apart(path):
     topics = [truth_topic(FRAMES[:5]), truth_topic(FRAMES[5:]), Topic("truth", "", [(0, b"x")], "json")]
     write_mcap(path, topics)
-    assert [c.messages for c in container.open_log(path).channels] == [5, 5, 1]
+    assert [c.messages for c in open_log(path).channels] == [5, 5, 1]
     recording = read(path, name="log")
     assert len(recording.truth.stamp_ns) == 10
     assert recording.notes == ("1 message of no schema (json) not read",)
@@ -321,7 +323,7 @@ def test_cut_off_anywhere_gives_a_recording_or_one_line(path):
     write_recording(path, FRAMES, chunk_size=1)
     whole = path.read_bytes()
     read_frames = []
-    for length in range(len(container.MAGIC), len(whole), 7):
+    for length in range(len(MAGIC), len(whole), 7):
         path.write_bytes(whole[:length])
         found = outcome(path)
         if isinstance(found, Recording):

@@ -17,7 +17,7 @@ from osi3trace.osi_trace import OSITrace
 from copem_replay.cli.main import main
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.draft.survey import survey
-from copem_replay.io import log as container
+from copem_replay.io.open import open_log
 from copem_replay.io.recorded_osi import read_recorded
 from copem_replay.io.recording import read
 from copem_replay.io.write.mcap import OSI_RECORD
@@ -104,7 +104,7 @@ def test_lists_of_a_unit(tmp_path):
 @pytest.mark.parametrize("said", ["gt", "sv", "sd"])
 def test_name_that_cannot_be_true(tmp_path, messages, kind, said):
     """The messages hold."""
-    log = container.open_log(trace(tmp_path, messages, BY_NAME.format(said)))
+    log = open_log(trace(tmp_path, messages, BY_NAME.format(said)))
     assert log.channels[0].schema == f"osi3.{kind}"
     true = {"GroundTruth": "gt", "SensorView": "sv", "SensorData": "sd"}[kind]
     assert log.notes == (() if said == true else (TAKEN.format(kind, f"says {said}"),))
@@ -116,19 +116,19 @@ def test_name_that_cannot_be_true(tmp_path, messages, kind, said):
 )
 def test_kind_of_real_messages(tmp_path, path, kind):
     """Messages of many writers, from 3.0 on, without a name to go by."""
-    log = container.open_log(path)
+    log = open_log(path)
     numbers = frozenset(c.number for c in log.channels if c.schema == f"osi3.{kind}" and c.messages)
     payloads = [payload for _, _, payload in log.payloads(numbers)]
     if not payloads:
         pytest.skip(f"no {kind} in {path.name}")
-    (channel,) = container.open_log(trace(tmp_path, payloads)).channels
+    (channel,) = open_log(trace(tmp_path, payloads)).channels
     assert (channel.schema, channel.messages) == (f"osi3.{kind}", len(payloads))
 
 
 def test_newer_release(tmp_path):
     """Fields that this release does not know do not hide what it knows."""
     unknown = b"\xfa\xff\x03" + bytes([60]) + b"x" * 60  # field 8191, 60 bytes
-    log = container.open_log(trace(tmp_path, [m.SerializeToString() + unknown for m in TRUTHS]))
+    log = open_log(trace(tmp_path, [m.SerializeToString() + unknown for m in TRUTHS]))
     assert log.channels[0].schema == "osi3.GroundTruth"
 
 
@@ -139,7 +139,7 @@ def test_messages_that_say_nothing(tmp_path):
         "its messages can be told for none of osi3.GroundTruth, osi3.SensorView, osi3.SensorData; if they are, name "
         "the file by OSI's convention: 20260102T030405Z_gt_380_2961_10_name.osi"
     )
-    named = container.open_log(trace(tmp_path, empty, BY_NAME.format("sv")))
+    named = open_log(trace(tmp_path, empty, BY_NAME.format("sv")))
     assert (named.channels[0].schema, named.notes) == ("osi3.SensorView", ())
 
 
@@ -155,7 +155,7 @@ def test_mcap_by_another_name(tmp_path):
 
 def test_out_of_order(tmp_path):
     """Messages come in the order of their time stamps."""
-    log = container.open_log(trace(tmp_path, TRUTHS[::-1]))
+    log = open_log(trace(tmp_path, TRUTHS[::-1]))
     assert [t for _, t, _ in log.payloads(frozenset({1}))] == [k * 10**8 for k in range(30)]
     assert log.start_ns == 0
 
@@ -174,7 +174,7 @@ def test_every_cut(tmp_path):
         if count == 0:
             assert problem(path).startswith("expected an OSI trace, found ")
             continue
-        log = container.open_log(path)
+        log = open_log(path)
         assert log.channels[0].messages == count
         assert log.damage == (None if length in ends else "the file ends too early")
 

@@ -17,9 +17,9 @@ from copem_replay.io.encodings.cdr import CdrDefinition
 from copem_replay.io.encodings.columns import Definition
 from copem_replay.io.encodings.json import JsonDefinition
 from copem_replay.io.encodings.protobuf import ProtobufDefinition
-from copem_replay.io.schemas.foxglove import SCHEMAS, description
+from copem_replay.io.schemas.foxglove import description
 from copem_replay.io.schemas.object_lists import Listed, listed
-from copem_replay.io.schemas.ros2 import DESCRIPTIONS
+from copem_replay.io.schemas.registry import SCHEMAS
 from tests.helpers.messages import SEPARATOR, classes, ids, quaternion, serialised, values
 
 COMMON = {
@@ -55,7 +55,7 @@ def written(name: str, text: str, *messages: dict[str, Any], encoding: str = "ro
     text = text.replace("MSG: p/", f"MSG: {name.split('/')[0]}/")
     definition = CdrDefinition(name, encoding, (idl or text).encode())
     payloads = [serialised(text, m, name=name) for m in messages]
-    made = DESCRIPTIONS[name](definition.offers())
+    made = SCHEMAS[name].description(definition.offers())
     return listed(definition, made, payloads, np.arange(len(payloads), dtype=np.int64))
 
 
@@ -540,5 +540,6 @@ def test_json_scenes_may_leave_out_much() -> None:
 
 
 def test_what_is_known_by_name() -> None:
-    assert len(DESCRIPTIONS) == 9
-    assert SCHEMAS == ("foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate")
+    scenes = {"foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate"}
+    assert scenes < set(SCHEMAS)
+    assert len(SCHEMAS) == 9 + len(scenes)

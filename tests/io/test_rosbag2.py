@@ -21,8 +21,9 @@ from rosbags.rosbag2 import Writer as RosWriter
 from copem_replay.cli.main import main
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.draft.survey import describe, survey
-from copem_replay.io import log as container
 from copem_replay.io.containers.rosbag2 import merged
+from copem_replay.io.log import Log
+from copem_replay.io.open import open_log
 from copem_replay.io.recording import Recording, read
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap, write_recording
@@ -73,14 +74,14 @@ def test_files_of_a_folder_are_one_recording(bag):
     assert len(recording.truth.start) == 3  # two tracks: nothing is cut where a file ends
     assert x_m(recording) == [1.0 * k for k in range(30)]
     assert recording.notes == ()
-    (channel,) = container.open_log(bag).channels
+    (channel,) = open_log(bag).channels
     assert (channel.topic, channel.messages) == ("truth", 30)
 
 
 def test_order_of_the_files_does_not_matter_for_times(bag):
     """Messages come in order of log time, whatever the description says first."""
     described(bag, ["bag_2.mcap", "bag_0.mcap", "bag_1.mcap"])
-    log = container.open_log(bag)
+    log = open_log(bag)
     times = [time_ns for _, time_ns, _ in log.payloads(frozenset({1}))]
     assert times == [k * 10**8 for k in range(30)]
     assert log.start_ns == 0
@@ -90,14 +91,14 @@ def test_files_that_overlap_in_time(bag):
     write_recording(bag / "bag_0.mcap", FRAMES[::2], host=1)
     write_recording(bag / "bag_1.mcap", FRAMES[1::2], host=1)
     described(bag, ["bag_0.mcap", "bag_1.mcap"])
-    assert [t for _, t, _ in container.open_log(bag).payloads(frozenset({1}))] == [k * 10**8 for k in range(30)]
+    assert [t for _, t, _ in open_log(bag).payloads(frozenset({1}))] == [k * 10**8 for k in range(30)]
 
 
 def test_channels_are_joined_by_what_they_are_not_by_their_numbers(bag):
     """In the second file the truth is channel 2, and a topic of the same name is of another schema."""
     frames = truth_topic(FRAMES[10:20], host=1)
     write_mcap(bag / "bag_1.mcap", [Topic("truth", "", [(10**9, b"x")], "json"), frames])
-    channels = container.open_log(bag).channels
+    channels = open_log(bag).channels
     assert [(c.topic, c.schema, c.messages) for c in channels] == [("truth", "osi3.GroundTruth", 30), ("truth", "", 1)]
     assert len(read(bag, name="log").truth.stamp_ns) == 30
 
@@ -105,7 +106,7 @@ def test_channels_are_joined_by_what_they_are_not_by_their_numbers(bag):
 def test_only_the_files_that_are_at_their_time_are_open(bag, monkeypatch):
     """Split recordings of hours have more files than a process may open."""
     now, most = set(), []
-    messages = container.Log.messages
+    messages = Log.messages
 
     def watched(log, numbers):
         now.add(log.path)
@@ -113,8 +114,8 @@ def test_only_the_files_that_are_at_their_time_are_open(bag, monkeypatch):
         yield from messages(log, numbers)
         now.discard(log.path)
 
-    monkeypatch.setattr(container.Log, "messages", watched)
-    log = container.open_log(bag)
+    monkeypatch.setattr(Log, "messages", watched)
+    log = open_log(bag)
     assert len(list(log.payloads(frozenset({1})))) == 30
     assert max(most) == 1
 
@@ -138,7 +139,7 @@ def test_folder_as_rosbags_writes_it(tmp_path):
         connection = writer.add_connection("/odom", kind, typestore=STORE)
         for k in range(5):
             writer.write(connection, k * 10**8, STORE.serialize_cdr(odometry(k / 10, 1.0 * k, 0.0), kind))
-    log = container.open_log(folder)
+    log = open_log(folder)
     (channel,) = log.channels
     assert (channel.topic, channel.schema, channel.encoding, channel.messages) == ("/odom", kind, "cdr", 5)
     with Reader(folder) as reader:

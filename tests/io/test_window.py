@@ -28,6 +28,7 @@ from copem_replay.experiment.validate import read_logs
 from copem_replay.io import log as container
 from copem_replay.io.containers import mcap_indexed as indexed
 from copem_replay.io.containers import mcap_records as chunks
+from copem_replay.io.open import open_log
 from copem_replay.io.recording import Recording, read
 from copem_replay.pipeline.run import run
 from tests.helpers.experiments import changed
@@ -223,7 +224,7 @@ class TestRos2:
             parts = [replace(t, messages=[m for m in t.messages if m[0] in span]) for t in ros_topics()]
             write_mcap(bag / f"{k}.mcap", parts, chunk_size=2000, finish=finish or k < 5)
         described(bag, [f"{k}.mcap" for k in range(6)])
-        log = container.open_log(bag)
+        log = open_log(bag)
         read_from = _files_opened(monkeypatch, log, _window(6.2, 8.4))
         assert read_from == {"0.mcap", "2.mcap", "3.mcap", "4.mcap", "5.mcap"}  # the first: /tf_static
         (boxes,) = (c.number for c in log.channels if c.topic == "/boxes")
@@ -538,7 +539,7 @@ def test_consecutive_windows_hold_every_message_once(small: tuple[Path, list[int
     path, times_ns = small
     near = st.sampled_from(times_ns).flatmap(lambda t: st.integers(max(t - 1, 0), t + 1))
     cuts = sorted(set(data.draw(st.lists(near | st.integers(0, times_ns[-1]), max_size=6))))
-    log = container.open_log(path)
+    log = open_log(path)
     ends = zip([0, *[c + 1 for c in cuts]], [*cuts, times_ns[-1]], strict=True)
     windows = [container.Window(first, last) for first, last in ends]
     found = [[m.data for m in log.within(w).messages({1, 2})] for w in windows]

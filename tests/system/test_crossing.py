@@ -24,6 +24,7 @@ from shapely import LineString, Polygon, affinity
 
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import across_logs, problems, read_logs
+from copem_replay.io.write.osi_trace import write_osi_trace
 from copem_replay.pipeline.run import run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -135,7 +136,7 @@ def test_the_committed_log_is_what_the_tool_makes(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "tools"))
         make_logs = importlib.import_module("make_logs")
-        make_logs.write_recording(make_logs.recipes()["crossing"](), tmp_path / LOG.name)
+        write_osi_trace(make_logs.recipes()["crossing"](), tmp_path / LOG.name)
     assert (tmp_path / LOG.name).read_bytes() == LOG.read_bytes(), "run python tools/make_logs.py crossing"
 
 

@@ -6,6 +6,7 @@ involved.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import math
 import subprocess
@@ -24,6 +25,8 @@ from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_object_pb2 import MovingObject
 from ruamel.yaml import YAML
 from shapely import LineString, Point, Polygon, affinity
+
+from copem_replay.io.write.osi_trace import write_osi_trace
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "logs" / "tc016d.mcap"
@@ -85,8 +88,8 @@ def _body(osi: Any) -> Body:
 
 def test_two_makes_give_the_same_bytes(make_logs: Any, tmp_path: Path) -> None:
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
-    make_logs.write_recording(make_logs.tc016d(), first)
-    make_logs.write_recording(make_logs.tc016d(), second)
+    write_osi_trace(make_logs.tc016d(), first)
+    write_osi_trace(make_logs.tc016d(), second)
     assert first.read_bytes() == second.read_bytes()
     assert sorted(tmp_path.iterdir()) == [first, second]
 
@@ -99,9 +102,9 @@ def test_the_committed_log_is_what_the_tool_makes(tmp_path: Path) -> None:
 
 def test_a_failed_make_leaves_no_file(make_logs: Any, tmp_path: Path) -> None:
     recording = make_logs.tc016d()
-    broken = make_logs.Recording(recording.description, {}, recording.messages)
+    broken = dataclasses.replace(recording, topics={})
     with pytest.raises(KeyError):
-        make_logs.write_recording(broken, tmp_path / "broken.mcap")
+        write_osi_trace(broken, tmp_path / "broken.mcap")
     assert not list(tmp_path.iterdir())
 
 

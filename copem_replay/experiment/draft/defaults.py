@@ -11,8 +11,10 @@ import numpy as np
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
+from copem_replay.io.channel import schema_name
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.recording import Recording, foreign, read_log
+from copem_replay.io.schemas.pose_schemas import ODOMETRY, is_pose
 
 if TYPE_CHECKING:
     from copem_replay.io.schemas.description import Fields
@@ -80,8 +82,7 @@ def _poses(log: Log) -> list[dict[str, str]]:
     if not foreign(log):
         return []
     from copem_replay.io.encodings.raw_values import DefinitionError
-    from copem_replay.io.schemas.poses import ODOMETRY, is_pose, poses_of
-    from copem_replay.io.schemas.registry import schema_name
+    from copem_replay.io.schemas.poses import poses_of
     from copem_replay.io.world_frame import gathered
 
     found: list[tuple[int, dict[str, str]]] = []

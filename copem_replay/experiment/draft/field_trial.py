@@ -10,13 +10,15 @@ from pydantic import ValidationError
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.draft.field_guess import propose, stamp_paths
+from copem_replay.io.channel import Channel
 from copem_replay.io.encodings.columns import take_apart
+from copem_replay.io.encodings.definition import definition_of
 from copem_replay.io.encodings.raw_values import DefinitionError
-from copem_replay.io.log import BrokenIndexError, Channel, Log
+from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.recording import Recording, foreign, read_log
 from copem_replay.io.schemas.description import Fields
-from copem_replay.io.schemas.poses import is_pose
-from copem_replay.io.schemas.registry import definition_of, is_list
+from copem_replay.io.schemas.pose_schemas import is_pose
+from copem_replay.io.schemas.registry import is_list
 
 _CHANNELS = 30
 """So many channels of a recording are looked at (chosen)."""
@@ -45,8 +47,12 @@ def proposals(log: Log, name: str) -> Iterator[tuple[dict[str, Any], Recording |
             try:
                 fields = Fields.model_validate({key: v for key, v in found["read"].items() if key != "topic"})
                 recording = read_log(log, name=name, topic=channel.topic, fields=fields)
-            except (RecordingError, BrokenIndexError, ValidationError) as error:
-                problem = str(error).removeprefix(f"{log.path}: ")
+            except RecordingError as error:
+                problem = "; ".join(error.within(log.path))
+            except BrokenIndexError as error:
+                problem = error.reason
+            except ValidationError as error:
+                problem = str(error)
         yield found | {"problem": problem}, recording
 
 

@@ -14,11 +14,14 @@ from copem_replay.core.text import counted, printable
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene
 from copem_replay.experiment.draft.defaults import suggestion
 from copem_replay.experiment.draft.template import read_block, short
-from copem_replay.io import log as container
-from copem_replay.io.log import Channel, Log
+from copem_replay.io.channel import Channel
+from copem_replay.io.log import Log
+from copem_replay.io.open import name_of, open_log
 from copem_replay.io.plausibility import MAX_GAP_S
 from copem_replay.io.recording import Recording, choose_topic, foreign, is_truth, moving_ids, read_log, truth_topics
 from copem_replay.io.schemas import osi_ground_truth as osi
+from copem_replay.io.schemas.pose_schemas import is_pose
+from copem_replay.io.schemas.registry import is_list
 
 if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
     from copem_replay.io.recorded_osi import RecordedLists
@@ -52,7 +55,7 @@ def survey(path: Path | str) -> dict[str, Any]:
     found |= {"damage": None, "topics": [], "truth": [], "log": str(path), "experiment": None}
     found["proposals"] = []
     try:
-        log = container.open_log(Path(path))
+        log = open_log(Path(path))
     except RecordingError as error:
         return found | {"reason": str(error)}
     found |= {"damage": log.damage, "topics": _topics(log)}
@@ -67,7 +70,7 @@ def survey(path: Path | str) -> dict[str, Any]:
     beside = [t["topic"] for t in found["topics"] if t["role"] == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=container.name_of(Path(path)), topic=topic, beside=beside)
+            recording = read_log(log, name=name_of(Path(path)), topic=topic, beside=beside)
         except RecordingError as error:
             failures.append(str(error))
             continue
@@ -99,9 +102,6 @@ def _topics(log: Log) -> list[dict[str, Any]]:
     truths = truth_topics(log)
     lists, poses = set[int](), set[int]()
     if foreign(log):
-        from copem_replay.io.schemas.poses import is_pose
-        from copem_replay.io.schemas.registry import is_list
-
         lists = {c.number for c in log.channels if is_list(c)}
         poses = {c.number for c in log.channels if is_pose(c)}
 
@@ -133,7 +133,7 @@ def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[di
         try:
             found = _lists(recording, topic, of_osi=topic in osis)
         except RecordingError as error:
-            yield said | {"problem": str(error).removeprefix(f"{recording.path}: ").removeprefix(f"{topic}: ")}
+            yield said | {"problem": "; ".join(error.within(recording.path, topic))}
             continue
         said |= {"lists": len(found.tracks.stamp_ns), "entries": len(found.tracks.frame_ix)}
         said |= {"covariances_said": bool(found.spread_said.all()), "captures_said": bool(found.capture_said.all())}
@@ -150,7 +150,7 @@ def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:
 
     found = read_listed(recording.path, topic, recording.scene, recording.around)
     if found is None:
-        raise RecordingError(f"{topic}: holds no list")
+        raise RecordingError("holds no list", path=recording.path, topic=topic)
     return found
 
 

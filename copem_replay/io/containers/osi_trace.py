@@ -23,9 +23,10 @@ from mcap.records import Message
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.text import counted
-from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES
+from copem_replay.io.channel import Channel
+from copem_replay.io.containers.mcap_records import CHUNK_LIMIT_BYTES, MAGIC
 from copem_replay.io.containers.unsupported import other_than
-from copem_replay.io.log import Channel, Log, open_file
+from copem_replay.io.log import Log, open_file
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.osi_ground_truth import GROUND_TRUTH, SENSOR_DATA, SENSOR_VIEW
 
@@ -66,6 +67,14 @@ class Trace(Log):
                     yield Message(number, time_ns, file.read(self.lengths[k]), time_ns, 0)
 
 
+def is_trace(path: Path) -> bool:
+    """Whether a file is to be read as OSI's trace of a single channel: by its name, unless it is MCAP all the same."""
+    if path.suffix.lower() != ".osi" or not path.is_file():
+        return False
+    with open_file(path) as file:
+        return file.read(len(MAGIC)) != MAGIC
+
+
 def open_trace(path: Path) -> Trace:
     """Look at a trace. Raises RecordingError: not read, no message in it, or nobody can tell of which kind."""
     said = _NAME.match(path.name)
@@ -94,7 +103,7 @@ def open_trace(path: Path) -> Trace:
     notes += [f"{counted(number, 'message')} {what}: skipped" for what, number in skipped.items()]
     if not offsets:
         why = "; ".join([*cut, *notes])
-        raise RecordingError(f"{path}: {'damaged, and ' if cut else ''}no message of {schema} can be read ({why})")
+        raise RecordingError(f"{'damaged, and ' if cut else ''}no message of {schema} can be read ({why})", path=path)
     order = np.argsort(np.array(times_ns), kind="stable")
     expected = int(said["frames"]) if said and cut else None
     topic = schema.removeprefix("osi3.")
@@ -159,7 +168,9 @@ def _time_ns(message: Any) -> int | None:
 def _schema(path: Path, named: str) -> tuple[str, list[str]]:
     """What the messages are, and a note where the file's name does not say. Raises RecordingError."""
     if named in _NOT_READ:
-        raise RecordingError(f"{path}: osi3.{_NOT_READ[named]} by its name, which is not read; {', '.join(_READ)} are")
+        raise RecordingError(
+            f"osi3.{_NOT_READ[named]} by its name, which is not read; {', '.join(_READ)} are", path=path
+        )
     with open_file(path) as file:
         first = [payload for _, payload in islice(_payloads(file, []), _TRIED)]
         if not first:
@@ -173,8 +184,9 @@ def _schema(path: Path, named: str) -> tuple[str, list[str]]:
         by_name = f"says {named}" if named in _READ else "does not say"
         return best, [f"taken for {best} by its messages: the name of the file {by_name}"]
     raise RecordingError(
-        f"{path}: its messages can be told for none of {', '.join(share)}; if they are, name the file by OSI's "
-        f"convention: 20260102T030405Z_gt_380_2961_{len(first)}_name.osi"
+        f"its messages can be told for none of {', '.join(share)}; if they are, name the file by OSI's "
+        f"convention: 20260102T030405Z_gt_380_2961_{len(first)}_name.osi",
+        path=path,
     )
 
 

@@ -16,9 +16,10 @@ from mcap.records import Message
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.text import counted
+from copem_replay.io.channel import Channel
 from copem_replay.io.containers.mcap_indexed import renumbered
 from copem_replay.io.containers.rosbag2_metadata import files_of, unnamed_in
-from copem_replay.io.log import BrokenIndexError, Channel, Log, from_start, open_mcap
+from copem_replay.io.log import BrokenIndexError, Log, from_start, open_mcap
 from copem_replay.io.window import Window, overlap
 
 
@@ -64,7 +65,7 @@ class Bag(Log):
                 why = error.__cause__ if log.path == error.path else None
                 logs.append(from_start(log.path, why, log.channels) if log.indexed else log)
             except RecordingError as found:
-                lost.append(_of_file(log.path, str(found)))
+                lost.append(_of_file(log.path, found))
         return _joined(self.path, logs, lost, self.notes).within(self.window)
 
 
@@ -86,7 +87,7 @@ def open_bag(folder: Path) -> Bag:
         try:
             logs.append(open_mcap(path))
         except RecordingError as error:
-            lost.append(_of_file(path, str(error)))
+            lost.append(_of_file(path, error))
     return _joined(folder, logs, lost, tuple(unnamed_in(folder, paths)))
 
 
@@ -94,8 +95,8 @@ def _joined(folder: Path, logs: Sequence[Log], lost: Sequence[str], notes: tuple
     if not logs:
         first, *others = lost
         more = f"; and so on, {counted(len(lost), 'file')} in all" if others else ""
-        raise RecordingError(f"{folder}: {first}{more}")
-    damages = [_of_file(log.path, log.damage) for log in logs if log.damage]
+        raise RecordingError(f"{first}{more}", path=folder)
+    damages = [f"{log.path.name}: {log.damage}" for log in logs if log.damage]
     numbers: dict[tuple[object, ...], int] = {}
     channels: dict[int, Channel] = {}
     parts = []
@@ -129,9 +130,9 @@ def _and(one: Channel, other: Channel) -> Channel:
     return replace(one, messages=one.messages + other.messages, expected=sum(expected) if known else None)
 
 
-def _of_file(path: Path, what: str) -> str:
+def _of_file(path: Path, error: RecordingError) -> str:
     """What is wrong with a file of the folder, under its own name."""
-    return f"{path.name}: {what.removeprefix(f'{path}: ')}"
+    return f"{path.name}: {'; '.join(error.within(path))}"
 
 
 def merged(streams: Sequence[tuple[int, Callable[[], Iterator[Message]]]]) -> Iterator[Message]:

@@ -29,11 +29,11 @@ def files_of(folder: Path) -> list[Path]:
     storage = _text(information, "storage_identifier")
     names = _names(information)
     if not names:
-        raise RecordingError(f"{place}: names no file (`relative_file_paths`)")
+        raise RecordingError("names no file (`relative_file_paths`)", path=place)
     if storage == "sqlite3" or any(name.endswith(".db3") for name in names):
-        raise RecordingError(f"{folder}: its files are of SQLite (.db3), which is not read; {CONVERT}")
+        raise RecordingError(f"its files are of SQLite (.db3), which is not read; {CONVERT}", path=folder)
     if _text(information, "compression_mode").lower() == "message":
-        raise RecordingError(f"{folder}: its messages are compressed one by one, which is not read; {CONVERT}")
+        raise RecordingError(f"its messages are compressed one by one, which is not read; {CONVERT}", path=folder)
     return [_file(folder, name) for name in names]
 
 
@@ -54,22 +54,24 @@ def _information(folder: Path) -> Node:
     except FileNotFoundError:
         how = "; name its files as logs of their own, or let `ros2 bag reindex` write it: then they are one"
         inside = how if any(folder.glob("*.mcap")) else ""
-        raise RecordingError(f"{folder}: expected a recording, found a folder without {METADATA}{inside}") from None
+        raise RecordingError(f"expected a recording, found a folder without {METADATA}{inside}", path=folder) from None
     except OSError as error:
-        raise RecordingError(f"{place}: cannot be opened: {error.strerror}") from None
+        raise RecordingError(f"cannot be opened: {error.strerror}", path=place) from None
     if len(content) > _LONGEST_BYTES:
-        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found more than 512 KiB")
+        raise RecordingError("expected the description of a rosbag2 folder, found more than 512 KiB", path=place)
     if _depth(content) > _DEEPEST:
-        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found brackets nested too deeply")
+        raise RecordingError(
+            "expected the description of a rosbag2 folder, found brackets nested too deeply", path=place
+        )
     try:
         root = composed(content.decode())
     except UnicodeDecodeError:
-        raise RecordingError(f"{place}: expected YAML, found text that is not UTF-8") from None
+        raise RecordingError("expected YAML, found text that is not UTF-8", path=place) from None
     except NotYamlError as error:
-        raise RecordingError(f"{place}: not YAML: line {error.line}: {error.why}") from None
+        raise RecordingError(f"not YAML: line {error.line}: {error.why}", path=place) from None
     information = _inner(root, _INFORMATION)
     if not isinstance(information, MappingNode):
-        raise RecordingError(f"{place}: expected the description of a rosbag2 folder, found no `{_INFORMATION}`")
+        raise RecordingError(f"expected the description of a rosbag2 folder, found no `{_INFORMATION}`", path=place)
     return information
 
 
@@ -93,7 +95,7 @@ def _names(information: Node) -> list[str]:
 def _file(folder: Path, name: str) -> Path:
     path = folder / name
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\0" in name:
-        raise RecordingError(f"{folder / METADATA}: expected files of the folder, found {name!r}")
+        raise RecordingError(f"expected files of the folder, found {name!r}", path=folder / METADATA)
     how = unpacking(path)
     try:
         if how is not None and path.with_suffix("").is_file():  # it was unpacked; what describes it stays as it is
@@ -102,9 +104,9 @@ def _file(folder: Path, name: str) -> Path:
     except OSError:  # a name that no file can have
         there = False
     if not there:
-        raise RecordingError(f"{path}: no such file, but {METADATA} names it")
+        raise RecordingError(f"no such file, but {METADATA} names it", path=path)
     if how is not None:
-        raise RecordingError(f"{path}: {how}")
+        raise RecordingError(how, path=path)
     return path
 
 

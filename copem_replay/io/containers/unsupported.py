@@ -36,7 +36,7 @@ def unpacking(path: Path) -> str | None:
 
 def other_than(expected: str, path: Path, start: bytes) -> RecordingError:
     """The error that says what a file is instead of what was expected, by its first 64 bytes."""
-    return RecordingError(f"{path}: {_what(expected, path, start)}")
+    return RecordingError(_what(expected, path, start), path=path)
 
 
 def _what(expected: str, path: Path, start: bytes) -> str:

@@ -1,8 +1,8 @@
 """Walking through protobuf messages, compiled: a table made from the schema says which fields to take.
 
-Wire format: protobuf.dev/programming-guides/encoding. The messages are in canonical form (`io/encodings/protobuf.py` sees to that):
-every field as its schema has it, those that are not repeated once. The kernel takes the bits of a number and the place
-of a text; it stays within the message whatever it says, and stops at what is none.
+Wire format: protobuf.dev/programming-guides/encoding. The messages are in canonical form (`io/encodings/protobuf.py`
+sees to that): every field as its schema has it, those that are not repeated once. The kernel takes the bits of a
+number and the place of a text; it stays within the message whatever it says, and stops at what is none.
 """
 
 from __future__ import annotations

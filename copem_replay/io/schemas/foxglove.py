@@ -11,7 +11,6 @@ from collections.abc import Collection
 from copem_replay.io.schemas.description import Class, Description, Fields, Life, Yaw
 from copem_replay.io.schemas.timestamps import stamps_in
 
-SCHEMAS = ("foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate")
 _KEYS = ("class", "category", "category_name", "classification", "label", "object_class", "type")
 
 

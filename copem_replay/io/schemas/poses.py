@@ -1,7 +1,4 @@
-"""Poses over time: odometry, stamped poses, and transforms between frames of reference.
-
-Sources: nav_msgs, geometry_msgs, tf2_msgs (ROS 2); foxglove.FrameTransform, FrameTransforms, PoseInFrame.
-"""
+"""Poses over time: odometry, stamped poses, and transforms between frames of reference."""
 
 from __future__ import annotations
 
@@ -11,55 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.tracks import Float, Int
+from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.encodings.columns import level_of, take_apart
-from copem_replay.io.log import Channel
-from copem_replay.io.schemas.registry import definition_of, schema_name
+from copem_replay.io.encodings.definition import definition_of
+from copem_replay.io.schemas.pose_schemas import POSES
 from copem_replay.io.schemas.timestamps import stamps_in
 
 _FARTHEST_M = 1e9  # a coordinate beyond is no position (chosen: far more than the earth is wide)
-
-
-@dataclass(frozen=True)
-class _Where:
-    """The fields of a schema; `inside`: the list that holds the poses, "" for the message itself."""
-
-    stamp: str
-    frame: str
-    position: str
-    rotation: str
-    child: str | None = None
-    inside: str = ""
-    velocity: str | None = None  # along the child's axes
-
-
-_ROS = {
-    "nav_msgs/msg/Odometry": _Where(
-        "header.stamp", "header.frame_id", "pose.pose.position", "pose.pose.orientation", "child_frame_id",
-        velocity="twist.twist.linear",
-    ),
-    "geometry_msgs/msg/PoseStamped": _Where("header.stamp", "header.frame_id", "pose.position", "pose.orientation"),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _Where(
-        "header.stamp", "header.frame_id", "pose.pose.position", "pose.pose.orientation"
-    ),
-    "geometry_msgs/msg/TransformStamped": _Where(
-        "header.stamp", "header.frame_id", "transform.translation", "transform.rotation", "child_frame_id"
-    ),
-    "tf2_msgs/msg/TFMessage": _Where(
-        "header.stamp", "header.frame_id", "transform.translation", "transform.rotation", "child_frame_id",
-        inside="transforms[].",
-    ),
-}  # fmt: skip
-_TRANSFORM = _Where("timestamp", "parent_frame_id", "translation", "rotation", "child_frame_id")
-_TRANSFORMS = _Where(
-    "timestamp", "parent_frame_id", "translation", "rotation", "child_frame_id", inside="transforms[]."
-)
-_POSE = _Where("timestamp", "frame_id", "pose.position", "pose.orientation")
-_KNOWN = _ROS | {
-    f"{package}{name}": where
-    for package in ("foxglove.", "foxglove_msgs/msg/")
-    for name, where in (("FrameTransform", _TRANSFORM), ("FrameTransforms", _TRANSFORMS), ("PoseInFrame", _POSE))
-}
-ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 @dataclass(frozen=True)
@@ -74,14 +29,9 @@ class Poses:
     child: tuple[str, ...]
 
 
-def is_pose(channel: Channel) -> bool:
-    """Whether the channel holds poses in a format that is known."""
-    return schema_name(channel) in _KNOWN and channel.encoding in ("cdr", "protobuf", "json")
-
-
 def poses_of(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) -> Poses:
     """The poses of a channel; what is no number, rotation or place is left out. Raises DefinitionError, KeyError."""
-    where = _KNOWN[schema_name(channel)]
+    where = POSES[schema_name(channel)]
     definition = definition_of(channel, payloads)
     p = where.inside
     numbers = [f"{p}{where.position}.{axis}" for axis in "xyz"] + [f"{p}{where.rotation}.{axis}" for axis in "xyzw"]

@@ -7,7 +7,7 @@ derived_object_msgs, visualization_msgs).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import Literal
 
 from copem_replay.io.schemas.description import Class, Description, Fields, Solid, Yaw
@@ -52,7 +52,7 @@ _DERIVED = {
 }
 
 
-def _autoware(offers: Collection[str]) -> Description:
+def autoware(offers: Collection[str]) -> Description:
     """DetectedObjects, TrackedObjects, PredictedObjects: centre of the box, twist along the object.
 
     The shape of a POLYGON (2) has no x and y, but a footprint.
@@ -90,7 +90,7 @@ def _autoware(offers: Collection[str]) -> Description:
     )
 
 
-def _detection3d(offers: Collection[str]) -> Description:
+def detection3d(offers: Collection[str]) -> Description:
     """vision_msgs: names and the place of the class changed after Foxy."""
     new = "detections[].results[].hypothesis.class_id" in offers
     kind, score = ("hypothesis.class_id", "hypothesis.score") if new else ("id", "score")
@@ -115,7 +115,7 @@ def _detection3d(offers: Collection[str]) -> Description:
     return Description(Fields.model_validate(fields))
 
 
-def _derived(offers: Collection[str]) -> Description:
+def derived(offers: Collection[str]) -> Description:
     """derived_object_msgs/ObjectArray, as the CARLA bridge writes it: twist along the axes of the list."""
     return Description(
         Fields.model_validate(
@@ -140,7 +140,7 @@ def _derived(offers: Collection[str]) -> Description:
     )
 
 
-def _markers(offers: Collection[str]) -> Description:
+def markers(offers: Collection[str]) -> Description:
     """visualization_msgs/MarkerArray: its cubes; an id is one within a namespace, and the namespace may say what."""
     return Description(
         Fields.model_validate(
@@ -162,16 +162,3 @@ def _markers(offers: Collection[str]) -> Description:
         only={"type": ("1",), "action": ("0",)},  # CUBE; ADD, which is MODIFY too
         within="ns",
     )
-
-
-def _autoware_names() -> list[str]:
-    packages = ("autoware_perception_msgs", "autoware_auto_perception_msgs")
-    return [f"{p}/msg/{kind}Objects" for p in packages for kind in ("Tracked", "Predicted", "Detected")]
-
-
-DESCRIPTIONS: Mapping[str, Callable[[Collection[str]], Description]] = {
-    **dict.fromkeys(_autoware_names(), _autoware),
-    "vision_msgs/msg/Detection3DArray": _detection3d,
-    "derived_object_msgs/msg/ObjectArray": _derived,
-    "visualization_msgs/msg/MarkerArray": _markers,
-}

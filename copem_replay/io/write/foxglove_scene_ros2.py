@@ -1,4 +1,4 @@
-"""foxglove_msgs/SceneUpdate, written: the same boxes as `io/write/foxglove_scene.py` draws, encoded as ROS 2 messages are."""
+"""foxglove_msgs/SceneUpdate, written: the boxes that `io/write/foxglove_scene.py` draws, encoded as ROS 2 messages."""
 
 from __future__ import annotations
 

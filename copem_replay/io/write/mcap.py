@@ -1,9 +1,9 @@
 """MCAP out: the input's channels with their messages untouched, and what each configuration believed.
 
 For each configuration three channels: `copem/<configuration>/objects` (what was believed), `…/scene` (the same as
-boxes) and `…/detail` (JSON: what the objects cannot carry), in messages of the input's family (`io/write/message_family.py`), one per
-fused list, log_time = publish_time = the instant it was available. The same input gives the same bytes; the file
-appears under its name when it is complete, or not at all.
+boxes) and `…/detail` (JSON: what the objects cannot carry), in messages of the input's family
+(`io/write/message_family.py`), one per fused list, log_time = publish_time = the instant it was available. The same
+input gives the same bytes; the file appears under its name when it is complete, or not at all.
 """
 
 from __future__ import annotations

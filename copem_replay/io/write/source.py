@@ -17,7 +17,7 @@ from mcap.records import Channel, Message
 from copem_replay.io.containers.mcap_indexed import renumbered
 from copem_replay.io.containers.osi_trace import Trace, message_class
 from copem_replay.io.containers.rosbag2 import Bag, merged
-from copem_replay.io.log import open_log
+from copem_replay.io.open import open_log
 from copem_replay.io.window import Window
 from copem_replay.io.write.message_family import OSI_CHANNEL, osi_version
 from copem_replay.io.write.pass_through import Catalogue, Original

@@ -12,12 +12,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
-from converters.parse import number, seconds_as_ns
-from converters.rotate import wrapped
-from converters.sumo_types import VehicleType, of_class, types
-from converters.trace import Box, Frame, Report
-from converters.xml_nodes import Node, parts
 from copem_replay.core.errors import InputError
+from copem_replay.io.convert.ground_truth import Box, Frame, Report
+from copem_replay.io.convert.parse import number, seconds_as_ns
+from copem_replay.io.convert.rotate import wrapped
+from copem_replay.io.convert.sumo_types import VehicleType, of_class, types
+from copem_replay.io.convert.xml_nodes import Node, parts
 
 _SHOWN: Final = 12  # ids named in an error (chosen)
 _CLASS: Final = {"vehicle": "passenger", "person": "pedestrian"}

@@ -17,13 +17,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from converters import openlabel_frames, rotate
-from converters.kinds import KINDS, Kind
-from converters.openlabel_frames import Edges
-from converters.parse import number, numbered, seconds_as_ns, shown
-from converters.trace import Box, Frame, Report
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
+from copem_replay.io.convert import openlabel_frames, rotate
+from copem_replay.io.convert.ground_truth import Box, Frame, Report
+from copem_replay.io.convert.kinds import KINDS, Kind
+from copem_replay.io.convert.openlabel_frames import Edges
+from copem_replay.io.convert.parse import number, numbered, seconds_as_ns, shown
 
 _NOWHERE_M: Final = -1000.0  # KITTI's position of what is none
 _KIND: Final = {  # lower case, without spaces and underscores

@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.feather
 
-from converters import rotate
-from converters.kinds import KINDS
-from converters.trace import Box, Frame, Report
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
+from copem_replay.io.convert import rotate
+from copem_replay.io.convert.ground_truth import Box, Frame, Report
+from copem_replay.io.convert.kinds import KINDS
 
 EGO_SIZE_M: Final = (4.877, 2.0, 1.473)
 """Length, width, height of the cars, Ford Fusion Hybrid; the recording `av2_3b3570b4` gives the ego this size."""

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from converters import rotate
-from converters.parse import number, shown
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
+from copem_replay.io.convert import rotate
+from copem_replay.io.convert.parse import number, shown
 
 Edges = dict[tuple[str, str], Float]
 """(4, 4) matrices by (from, to)."""

@@ -15,14 +15,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from converters import restricted_pickle
-from converters.kinds import KINDS, Kind
-from converters.parse import LAST_SECOND, numbered, shown
-from converters.rotate import wrapped
-from converters.trace import Box, Frame, Report
 from copem_replay.core.errors import InputError
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool, Float
+from copem_replay.io.convert import restricted_pickle
+from copem_replay.io.convert.ground_truth import Box, Frame, Report
+from copem_replay.io.convert.kinds import KINDS, Kind
+from copem_replay.io.convert.parse import LAST_SECOND, numbered, shown
+from copem_replay.io.convert.rotate import wrapped
 
 _MOST_COLUMNS: Final = 16  # chosen; there are at most 3
 _MOST_STEPS: Final = 10_000_000  # chosen: eleven days at 10 Hz

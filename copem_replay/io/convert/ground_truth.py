@@ -1,4 +1,4 @@
-"""From boxes to a recording of osi3.GroundTruth: what every converter ends in."""
+"""From boxes to a recording of osi3.GroundTruth: the last step of every converter."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import osi3
 from osi3.osi_groundtruth_pb2 import GroundTruth
 
-from converters.kinds import Kind
-from converters.parse import LAST_SECOND
 from copem_replay.core.errors import InputError
 from copem_replay.core.text import counted
-from make_logs import NANOS_PER_SECOND, Recording, write_recording
+from copem_replay.io.convert.kinds import Kind
+from copem_replay.io.convert.parse import LAST_SECOND
+from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace, empty_ground_truth, write_osi_trace
 
 TOPIC: Final = "ground_truth"
 RECORD: Final = "copem_replay.conversion"
@@ -74,14 +73,14 @@ class Report:
 def write(path: Path, frames: Iterable[Frame], report: Report, *, source: Path, format_name: str) -> None:
     """Write the recording, in full or not at all. Raises InputError: no object, or times that make no sense."""
     record: dict[str, str] = {}
-    recording = Recording(
+    trace = OsiTrace(
         description=f"{source.name}, converted from {format_name}",
         topics={TOPIC: "osi3.GroundTruth: all objects of the source"},
         messages=_messages(frames, report, source, format_name, record),
-        source=f"{format_name}: {source.name} (tools/convert.py)",
+        source=f"{format_name}: {source.name} (copem-replay convert)",
         records={RECORD: record},
     )
-    write_recording(recording, path)
+    write_osi_trace(trace, path)
 
 
 def _messages(
@@ -108,12 +107,7 @@ def _messages(
 
 
 def _message(frame: Frame, report: Report) -> GroundTruth:
-    osi = GroundTruth()
-    parts = (int(part) for part in osi3.__version__.split(".")[:3])
-    osi.version.version_major, osi.version.version_minor, osi.version.version_patch = parts
-    osi.timestamp.seconds, osi.timestamp.nanos = divmod(frame.stamp_ns, NANOS_PER_SECOND)
-    if frame.host is not None:
-        osi.host_vehicle_id.value = frame.host
+    osi = empty_ground_truth(frame.stamp_ns, frame.host)
     for box in frame.boxes:
         if not all(map(math.isfinite, (*box.at_m, box.yaw_rad, *box.size_m))):
             report.count("object state", "with a number that is none: skipped")

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from converters.kinds import KINDS, Kind
-from converters.parse import number, numbered, positive, seconds_as_ns, shown
-from converters.rotate import wrapped
-from converters.trace import Box, Frame, Report
 from copem_replay.core.errors import InputError
+from copem_replay.io.convert.ground_truth import Box, Frame, Report
+from copem_replay.io.convert.kinds import KINDS, Kind
+from copem_replay.io.convert.parse import number, numbered, positive, seconds_as_ns, shown
+from copem_replay.io.convert.rotate import wrapped
 
 REQUIRED: Final = ("time_s", "id", "class", "x_m", "y_m", "length_m", "width_m")
 YAW: Final = ("yaw_deg", "yaw_rad")  # one of them

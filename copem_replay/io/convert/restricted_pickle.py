@@ -57,7 +57,7 @@ class _Array(np.ndarray[Any, Any]):
 
     take_from: Callable[[int], None]
 
-    def __setstate__(self, state: tuple[Any, ...]) -> None:  # type: ignore[override]
+    def __setstate__(self, state: Any) -> None:
         _version, shape, given, fortran, content = state
         dtype = _plain(given)
         if self.shape != (0,) or not all(type(n) is int and n >= 0 for n in shape):
@@ -67,7 +67,7 @@ class _Array(np.ndarray[Any, Any]):
             raise pickle.UnpicklingError(f"an array of shape {shape} with other content")
         self.take_from(expected)
         del self.take_from
-        super().__setstate__((1, shape, dtype, bool(fortran), content))
+        super().__setstate__((1, shape, dtype, bool(fortran), content))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         return repr(self.view(np.ndarray))
@@ -138,7 +138,8 @@ class _Restricted(pickle.Unpickler):
         """How old pickles spell bytes; no other codec, some of them unpack."""
         if encoding != "latin1":
             raise pickle.UnpicklingError(f"bytes as {encoding}")
-        return self._counted(text).encode("latin1")
+        encoded: bytes = self._counted(text).encode("latin1")
+        return encoded
 
     def _dtype(self, name: str, align: object = False, copy: object = False) -> _Dtype:
         return _Dtype(name, align, copy)

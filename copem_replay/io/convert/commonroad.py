@@ -14,12 +14,12 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Final
 
-from converters.kinds import KINDS, Kind
-from converters.parse import number, positive, seconds_as_ns, shown
-from converters.rotate import wrapped
-from converters.trace import Box, Frame, Report
-from converters.xml_nodes import Node, parts
 from copem_replay.core.errors import InputError
+from copem_replay.io.convert.ground_truth import Box, Frame, Report
+from copem_replay.io.convert.kinds import KINDS, Kind
+from copem_replay.io.convert.parse import number, positive, seconds_as_ns, shown
+from copem_replay.io.convert.rotate import wrapped
+from copem_replay.io.convert.xml_nodes import Node, parts
 
 _KIND: Final = {
     "bicycle": "bicycle",

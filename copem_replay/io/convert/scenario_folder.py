@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from converters import restricted_pickle
-from converters.parse import shown
 from copem_replay.core.errors import InputError
+from copem_replay.io.convert import restricted_pickle
+from copem_replay.io.convert.parse import shown
 
 _MAPPING: Final = "dataset_mapping.pkl"
 _SUMMARY: Final = "dataset_summary.pkl"  # of the metadata, which the scenarios have themselves

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from converters.kinds import KINDS, Kind
-from converters.parse import positive
-from converters.xml_nodes import Node, parts
 from copem_replay.core.errors import InputError
+from copem_replay.io.convert.kinds import KINDS, Kind
+from copem_replay.io.convert.parse import positive
+from copem_replay.io.convert.xml_nodes import Node, parts
 
 _CLASSES: Final = {  # vClass: kind, length, width, height in m
     "passenger": ("car", 5.0, 1.8, 1.5),

@@ -1,0 +1,139 @@
+"""`copem-replay convert FORMAT SOURCE --out FILE`: a command per format, for each has options of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from copem_replay.core.errors import InputError
+from copem_replay.core.text import printable
+
+app = typer.Typer(
+    help="Convert a data set or a simulation to a recording of OSI truth (MCAP).", rich_markup_mode=None
+)  # fmt: skip
+
+Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of the format.")]
+Out = Annotated[Path, typer.Option(metavar="FILE", help="Recording to write (.mcap).")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there already.")]
+Metres = tuple[float, float, float]
+
+
+@app.callback(invoke_without_command=True)
+def formats(context: typer.Context) -> None:
+    """Refuse a command without a format."""
+    if context.invoked_subcommand is None:
+        names = ", ".join(command.callback.__name__ for command in app.registered_commands if command.callback)
+        raise InputError(f"copem-replay convert: expected a format, one of {names}; --help tells more")
+
+
+@app.command()
+def argoverse2(
+    source: Source,
+    out: Out,
+    overwrite: Overwrite = False,
+    ego_size_m: Annotated[
+        Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Of the ego vehicle [4.877 2 1.473].")
+    ] = None,
+    centre_from_rear_axle_m: Annotated[
+        Metres | None,
+        typer.Option(metavar="AHEAD LEFT UP", help="Centre of the ego's box from its rear axle [1.339 0 0.438]."),
+    ] = None,
+) -> int:
+    """Argoverse 2: the folder of a sensor log."""
+    options: dict[str, Any] = {}
+    if ego_size_m is not None:
+        options["ego_size_m"] = tuple(_positive(value, "--ego-size-m") for value in ego_size_m)
+    if centre_from_rear_axle_m is not None:
+        name = "--centre-from-rear-axle-m"
+        options["centre_from_rear_axle_m"] = tuple(_finite(value, name) for value in centre_from_rear_axle_m)
+    return _converted("argoverse2", source, out, overwrite, **options)
+
+
+@app.command()
+def scenarionet(
+    source: Source,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Recording to write; of a folder: another folder.")],
+    overwrite: Overwrite = False,
+    ego_centre_m: Annotated[
+        float | None,
+        typer.Option(
+            metavar="AHEAD", help="Centre of the ego's box ahead of its position [1.385 for nuScenes, else 0]."
+        ),
+    ] = None,
+) -> int:
+    """ScenarioNet (nuScenes, Waymo, …): a pickle, or a folder."""
+    centre_m = None if ego_centre_m is None else _finite(ego_centre_m, "--ego-centre-m")
+    return _converted("scenarionet", source, out, overwrite, ego_centre_m=centre_m)
+
+
+@app.command()
+def openlabel(
+    source: Source,
+    out: Out,
+    overwrite: Overwrite = False,
+    rate_hz: Annotated[float | None, typer.Option(metavar="HZ", help="Of frames without time stamps.")] = None,
+    from_system: Annotated[
+        str | None, typer.Option("--from", metavar="SYSTEM", help="Coordinate system of cuboids that name none.")
+    ] = None,
+    to_system: Annotated[
+        str | None, typer.Option("--to", metavar="SYSTEM", help="Coordinate system of the recording [the root].")
+    ] = None,
+) -> int:
+    """OpenLABEL (KITTI, TUMTraf, …): a JSON file, or a folder."""
+    rate_hz = None if rate_hz is None else _positive(rate_hz, "--rate-hz")
+    return _converted("openlabel", source, out, overwrite, rate_hz=rate_hz, source=from_system, target=to_system)
+
+
+@app.command()
+def commonroad(source: Source, out: Out, overwrite: Overwrite = False) -> int:
+    """CommonRoad 2018b or 2020a: an XML file."""
+    return _converted("commonroad", source, out, overwrite)
+
+
+@app.command()
+def sumo(
+    source: Source,
+    out: Out,
+    overwrite: Overwrite = False,
+    types: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="File with <vType>; may be given several times.")
+    ] = None,
+    host: Annotated[str | None, typer.Option(metavar="ID", help="Vehicle that is the host.")] = None,
+) -> int:
+    """SUMO: the XML file of --fcd-output."""
+    return _converted("sumo", source, out, overwrite, type_files=types or (), host=host)
+
+
+@app.command()
+def csv(source: Source, out: Out, overwrite: Overwrite = False) -> int:
+    """CSV: a table with units in the names of its columns."""
+    return _converted("csv", source, out, overwrite)
+
+
+def _positive(value: float, option: str) -> float:
+    from copem_replay.io.convert.parse import positive
+
+    return positive(value, option)
+
+
+def _finite(value: float, option: str) -> float:
+    from copem_replay.io.convert.parse import number
+
+    return number(value, option)
+
+
+def _converted(format: str, source: Path, out: Path, overwrite: bool, /, **options: Any) -> int:
+    """Convert, print a line per recording and the notes. Raises InputError with every problem at once."""
+    from copem_replay.io.convert.conversion import Conversion, convert_all, outputs
+
+    conversion = Conversion()
+    asked = outputs(source, out, format=format, overwrite=overwrite)
+    for line in convert_all(asked, conversion, format=format, options=options):
+        print(printable(line))
+    for note in conversion.note_lines():
+        print(printable(f"note: {note}"))
+    if problems := conversion.problem_lines():
+        raise InputError(problems)
+    return 0

@@ -1,0 +1,50 @@
+"""The fields of errors, from which messages are made and by which callers go."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import pytest
+
+from copem_replay.core.errors import EgoError, EmptyWindowError, RecordingError
+
+LOG = Path("logs/a.mcap")
+
+
+def test_a_recording_error_names_its_place_and_keeps_it() -> None:
+    error = RecordingError("holds no list", path=LOG, topic="/objects", key=("read", "topic"))
+    assert error.problems == ("logs/a.mcap: /objects: holds no list",)
+    assert (error.path, error.topic, error.key) == (LOG, "/objects", ("read", "topic"))
+    assert error.reasons == ("holds no list",)
+
+
+@pytest.mark.parametrize(
+    ("path", "topic", "expected"),
+    [
+        (LOG, None, "/objects: holds no list"),
+        (LOG, "/objects", "holds no list"),
+        (Path("logs"), "/objects", "logs/a.mcap: holds no list"),  # of a folder: which file of it
+    ],
+)
+def test_what_a_message_names_already_is_left_out(path: Path, topic: str | None, expected: str) -> None:
+    assert RecordingError("holds no list", path=LOG, topic="/objects").within(path, topic) == [expected]
+
+
+def test_an_ego_error_is_about_the_ego() -> None:
+    error = EgoError("no moving object '9'", path=LOG)
+    assert str(error) == "logs/a.mcap: ego: no moving object '9'"
+    assert (error.key, error.reasons) == (("ego",), ("no moving object '9'",))
+
+
+def test_names_cannot_break_the_line() -> None:
+    error = RecordingError("no\nlist", path=LOG, topic="a\x1b[1m")
+    assert error.problems == (r"logs/a.mcap: a\x1b[1m: no\nlist",)
+    assert error.within(LOG) == [r"a\x1b[1m: no\nlist"]
+
+
+def test_workers_hand_errors_on_whole() -> None:
+    error = pickle.loads(pickle.dumps(EmptyWindowError(["one", "two"], path=LOG, topic="t", key=("window_s",))))
+    assert type(error) is EmptyWindowError
+    assert error.problems == ("logs/a.mcap: t: one", "logs/a.mcap: t: two")
+    assert (error.path, error.topic, error.key) == (LOG, "t", ("window_s",))
