@@ -36,12 +36,8 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
 
 
 def _folders(package: Path) -> list[str]:
-    """The package, and the packages in it."""
-    with os.scandir(package) as entries:
-        return [
-            str(package),
-            *(entry.path for entry in entries if entry.is_dir() and os.path.exists(f"{entry.path}/__init__.py")),
-        ]
+    """The package, and all packages in it, at any depth."""
+    return [place for place, _, names in os.walk(package) if place == str(package) or "__init__.py" in names]
 
 
 def _writable(folder: str | None) -> bool:
@@ -70,3 +66,7 @@ def _own_folder() -> tuple[str, str]:
     mine = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
     atexit.register(shutil.rmtree, mine, ignore_errors=True)
     return mine, f" for this process alone ({folder} is not a folder of this user alone)"
+
+
+CACHE_NOTE = prepare_cache(Path(__file__).parents[1])
+"""What has to be said of where compiled code is cached: None, nothing."""
