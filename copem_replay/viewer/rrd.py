@@ -55,10 +55,10 @@ def write_rrd(
 ) -> list[str]:
     """Write one run of one log, and send it to a viewer, too. Returns notes for the user. Raises OutputError.
 
-    `beliefs`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a
-    frame per list it issued (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and
-    runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration differences to which
-    are marked.
+    `beliefs`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a frame per
+    list it issued (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`:
+    of all logs and runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration
+    differences to which are marked.
     """
     rest = iter(beliefs)
     first = next(rest)
