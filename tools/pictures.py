@@ -65,6 +65,7 @@ def _replay(folder: Path) -> None:
     from copem_replay.experiment.validate import problems, read_logs
     from copem_replay.pipeline.run import run
     from copem_replay.results.write import write_results
+    from copem_replay.viewer.export import EXPORTERS
 
     source = load(ROOT / "logs/tc016d.yaml")
     experiment, wrong = problems(source)
@@ -72,7 +73,7 @@ def _replay(folder: Path) -> None:
         sys.exit("\n".join(wrong))
     experiment = experiment.model_copy(update={"show": Show(run="median")})
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    write_results(folder, experiment, recordings, run(experiment, recordings))
+    write_results(folder, experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
 
 
 def _differences(folder: Path, out: Path) -> None:

@@ -22,8 +22,8 @@ try:  # before `main` is there to catch it
 
     import typer
 
-    import copem_replay
     from copem_replay.cli import convert
+    from copem_replay.core.compiled import CACHE_NOTE
     from copem_replay.core.errors import CopemError, InputError, OutputError
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
@@ -164,14 +164,17 @@ def run(
         url = _viewer(ready, viewer) if live or viewer is not None else None
         from copem_replay.metrics.summary_text import summary_text
         from copem_replay.pipeline.run import run as run_experiment
+        from copem_replay.results.export import MCAP
         from copem_replay.results.write import fill_place
+        from copem_replay.viewer.export import rrd_to
 
         prepared, warnings = _prepared(source, ready, recordings)
         _complain(f"note: {warning}" for warning in warnings)
         result = _with_progress(
             lambda progress: run_experiment(ready, recordings, jobs=_workers(jobs), progress=progress, ready=prepared)
         )
-        notes = fill_place(place, ready, recordings, result, skipped=skipped, viewer=url)
+        exporters = [MCAP, rrd_to(url)]
+        notes = fill_place(place, ready, recordings, result, exporters=exporters, skipped=skipped)
         notes = place.notes + [f"{path}: skipped: {reason}" for path, reason in skipped] + notes + list(result.costs)
         _complain(f"note: {note}" for note in notes)
         print(summary_text(result.summary))
@@ -440,8 +443,8 @@ def main() -> None:
         if number == signal.SIGTERM or signal.getsignal(number) != signal.SIG_IGN:  # nohup has it ignored
             signal.signal(number, lambda number, frame: sys.exit(128 + number))
     code = _ended()
-    if copem_replay.CACHE_NOTE is not None and "numba" in sys.modules:  # something may have been compiled
-        _complain([f"note: {copem_replay.CACHE_NOTE}"])
+    if CACHE_NOTE is not None and "numba" in sys.modules:  # something may have been compiled
+        _complain([f"note: {CACHE_NOTE}"])
     sys.exit(code)
 
 

@@ -66,3 +66,7 @@ def _own_folder() -> tuple[str, str]:
     mine = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
     atexit.register(shutil.rmtree, mine, ignore_errors=True)
     return mine, f" for this process alone ({folder} is not a folder of this user alone)"
+
+
+CACHE_NOTE = prepare_cache(Path(__file__).parents[1])
+"""What has to be said of where compiled code is cached: None, nothing."""

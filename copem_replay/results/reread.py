@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.schema import Experiment
@@ -11,7 +12,9 @@ from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Objects
 from copem_replay.pipeline.log_replay import Replay, prepare
-from copem_replay.results.folder import Results
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 
 def reread(results: Results, log: str, object_id: str) -> Replay:
@@ -32,18 +35,19 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
 
     Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
     """
-    file = next(file for file in results.logs if file.name == log)
+    file = next(file for file in results.provenance.logs if file.name == log)
+    path = results.log_path(log)
     try:
-        found = sha256_of(file.path)
+        found = sha256_of(path)
     except RecordingError as error:
         raise RecordingError(f"{error}; put the log back to draw its runs") from None
     if found != file.sha256:
         raise RecordingError(
             f"expected the log that was replayed, SHA-256 {file.sha256[:12]}…, found {found[:12]}…; "
             "put that log back, or run the experiment again",
-            path=file.path,
+            path=path,
         )
-    recordings, refused = read_logs(experiment, [file.path], results.source)
+    recordings, refused = read_logs(experiment, [path], results.source)
     if refused:
         raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
     # Draws are addressed by the log's name, which depends on what else was replayed.

@@ -1,7 +1,7 @@
 """The results folder: complete under its name, or not there at all.
 
-Everything is written into a folder beside it first, which then takes its name (`results/place.py`). Same input, same seed: the
-same bytes in all but the .rrd.
+Everything is written into a folder beside it first, which then takes its name (`results/place.py`). Same input, same
+seed: the same bytes in all but the .rrd.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
 from copem_replay.pipeline.sweep import resolved
 from copem_replay.results.belongings import MARK
+from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
 
 _LIBRARIES = (
@@ -43,17 +44,18 @@ def write_results(
     recordings: Sequence[Recording],
     result: Result,
     *,
+    exporters: Sequence[Exporter],
     skipped: Sequence[tuple[Path, str]] = (),
     overwrite: bool = False,
-    viewer: str | None = None,
 ) -> list[str]:
-    """Write the folder of the contract. Returns what has to be said of it. Raises OutputError.
+    """Write the results folder. Returns notes for the user. Raises OutputError.
 
-    `viewer`: where a Rerun viewer listens that shall get what is written to .rrd, too.
+    `exporters`: each writes every shown run (`show` in the experiment) as a file, `MCAP` and `RRD` for instance.
+    `skipped`: recordings that are left out, and why.
     """
     with taken(folder, overwrite=overwrite) as place:
         check_inputs(place, [recording.path for recording in recordings])
-        notes = fill_place(place, experiment, recordings, result, skipped=skipped, viewer=viewer)
+        notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
         return place.notes + notes
 
 
@@ -63,21 +65,25 @@ def fill_place(
     recordings: Sequence[Recording],
     result: Result,
     *,
+    exporters: Sequence[Exporter],
     skipped: Sequence[tuple[Path, str]] = (),
-    viewer: str | None = None,
 ) -> list[str]:
     """The same into a place that is taken, whose `folder` and `notes` may change. Raises OutputError."""
-    files = _files(experiment, recordings, result)
+    files = _files(experiment, recordings, result, exporters)
     try:
         place.will_hold(files)
-        notes = _fill(place.new, place.folder, experiment, recordings, result, skipped, viewer)
+        notes = _fill(place, experiment, recordings, result, exporters)
+        provenance = provenance_of(experiment, recordings, result, skipped, notes) | {"files": files}
+        (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
     except OSError as error:
         raise OutputError(f"{place.folder}: cannot be written: {error.strerror or error}") from error
     return notes
 
 
-def _files(experiment: Experiment, recordings: Sequence[Recording], result: Result) -> list[str]:
+def _files(
+    experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
+) -> list[str]:
     """What is going to be in the folder, by names relative to it."""
     files = [EXPERIMENT, MARK, "detections.parquet", "summary.csv"]
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
@@ -85,7 +91,7 @@ def _files(experiment: Experiment, recordings: Sequence[Recording], result: Resu
         files += [f"{name}.parquet" for name in _ACCURACY if getattr(result.accuracy, name) is not None] + ["bands.csv"]
     for log in shown_logs(experiment, result):
         for shown in shown_runs(experiment, result, log):
-            files += [f"{_target(shown, log, recordings)}.{kind}" for kind in ("mcap", "rrd")]
+            files += [_target(shown, log, recordings) + exporter.suffix for exporter in exporters]
     return sorted(files)
 
 
@@ -95,11 +101,11 @@ def _target(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
 
 
 def _fill(
-    scratch: Path, folder: Path, experiment: Experiment, recordings: Sequence[Recording], result: Result,
-    skipped: Sequence[tuple[Path, str]], viewer: str | None,
-) -> list[str]:  # fmt: skip
-    data = resolved(experiment).as_written()
-    data["logs"] = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
+    place: Place, experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
+) -> list[str]:
+    """Write all files but the provenance. Returns notes for the user."""
+    data, scratch = resolved(experiment).as_written(), place.new
+    data["logs"] = [os.path.relpath(place_of(recording.path), place.folder) for recording in recordings]
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
     write_csv(result.summary, scratch / "summary.csv")
@@ -110,35 +116,23 @@ def _fill(
     if result.sweep is not None:
         write_csv(result.sweep, scratch / "sweep.csv")
     notes = list(result.notes)
-    for log in shown_logs(experiment, result):
+    for log in shown_logs(experiment, result) if exporters else ():
         for shown in shown_runs(experiment, result, log):
             target = scratch / _target(shown, log, recordings)
-            said = _show(target, log, shown, experiment, recordings, result, viewer)
+            run = _run_to_export(log, shown, experiment, recordings, result)
+            said = [line for exporter in exporters for line in exporter.write(Path(f"{target}{exporter.suffix}"), run)]
             notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
-    provenance = provenance_of(experiment, recordings, result, skipped, notes)
-    (scratch / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return notes
 
 
-def _show(
-    target: Path,
-    log: str,
-    shown: ShownRun,
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    result: Result,
-    viewer: str | None,
-) -> list[str]:
-    from copem_replay.io.write.mcap import write_mcap
-    from copem_replay.io.write.message_family import family_of
-    from copem_replay.viewer import write_rrd
-
+def _run_to_export(
+    log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
+) -> RunToExport:
+    """One run of one log, in the configurations that the experiment shows."""
     recording = next(r for r in recordings if r.scene.log == log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
-    one = one_run(recording, chosen, shown.run, next(r for r in result.replays if r.scene.log == log))
-    of_run_shown = (result.table["log"] == log) & (result.table["run"] == shown.run)
-    rows = result.table[of_run_shown & result.table["configuration"].isin(list(chosen.configurations))]
-    summary = result.summary[result.summary["configuration"].isin(list(chosen.configurations))]
+    names = list(chosen.configurations)
+    of_run = (result.table["log"] == log) & (result.table["run"] == shown.run)
     manifest = {
         "copem_replay": version("copem-replay"),
         "experiment": dump(resolved(experiment).as_written() | {"logs": [log_path_of(recordings, log).name]}),
@@ -146,26 +140,13 @@ def _show(
         "run": str(shown.run),
         "run_is": shown.why,
     }
-    said = write_mcap(
-        Path(f"{target}.mcap"),
-        recording.path,
-        one.replay.scene,
-        one.beliefs,
-        rows,
+    return RunToExport(
+        recording,
+        shown,
+        one_run(recording, chosen, shown.run, next(r for r in result.replays if r.scene.log == log)),
+        result.table[of_run & result.table["configuration"].isin(names)],
+        result.summary[result.summary["configuration"].isin(names)],
         manifest,
-        family_of(recording),
-        recording.window,
-    )
-    return said + write_rrd(
-        Path(f"{target}.rrd"),
-        one.replay,
-        one.experiment,
-        one.beliefs,
-        rows,
-        summary,
-        shown.run,
-        run_is=shown.why,
-        viewer=viewer,
     )
 
 
@@ -199,7 +180,6 @@ def provenance_of(
             for log, runs in shown.items()
         },
         "notes": list(notes),
-        "files": _files(experiment, recordings, result),
     }  # fmt: skip
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -17,28 +19,14 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.log_replay import Replay
 from copem_replay.pipeline.visibility_curves import share_curves
 from copem_replay.viewer import (
-    blueprint as layout,
-)
-from copem_replay.viewer import (
-    boxes as world,
-)
-from copem_replay.viewer import (
-    curves as plots,
-)
-from copem_replay.viewer import (
+    blueprint,
+    boxes,
+    curves,
     differences,
-)
-from copem_replay.viewer import (
-    event_markers as marks,
-)
-from copem_replay.viewer import (
-    sensors as units,
-)
-from copem_replay.viewer import (
-    status_drawing as knowledge,
-)
-from copem_replay.viewer import (
-    text_panels as words,
+    event_markers,
+    sensors,
+    status_drawing,
+    text_panels,
 )
 from copem_replay.viewer.camera import eye_on, follow
 from copem_replay.viewer.kept import Kept
@@ -47,6 +35,9 @@ from copem_replay.viewer.selection import SHOWN_OBJECTS, VIEWED, telling, viewed
 from copem_replay.viewer.sink import Out, digest, part_of
 from copem_replay.viewer.status import clock_of, status_of
 from copem_replay.viewer.stream import Live, file_stream
+
+if TYPE_CHECKING:  # a second to import: only where something is written
+    from rerun import blueprint as rrb
 
 
 def write_rrd(
@@ -62,15 +53,13 @@ def write_rrd(
     baseline: str | None = None,
     viewer: str | None = None,
 ) -> list[str]:
-    """Write one run of one log, and send it to a viewer, too. Returns what has to be said. Raises OutputError.
+    """Write one run of one log, and send it to a viewer, too. Returns notes for the user. Raises OutputError.
 
-    `beliefs`: stretch by stretch, per configuration what the receiver believes in this run, a frame per list it issued
-    (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and
-    runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration differences to which
-    are marked.
+    `beliefs`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a frame per
+    list it issued (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`:
+    of all logs and runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration
+    differences to which are marked.
     """
-    import rerun as rr
-
     rest = iter(beliefs)
     first = next(rest)
     chosen = viewed(experiment, list(first), baseline)
@@ -78,46 +67,59 @@ def write_rrd(
     of_chosen = table["configuration"].isin(chosen)
     truths = [name for name in chosen if experiment.configurations[name].units == TRUTH]
     shown = [replay.scene.object_number[name] for name in telling(table[of_chosen], truths, SHOWN_OBJECTS)]
-    eye = eye_on(replay, experiment, table, layout.aspect(len(chosen)))
-    blueprint, appearance = layout.blueprint(replay, experiment, table, chosen, shown, eye, baseline)
+    eye = eye_on(replay, experiment, table, blueprint.aspect(len(chosen)))
+    panels, appearance = blueprint.blueprint(replay, experiment, table, chosen, shown, eye, baseline)
     # The viewer takes two files of one identity for one recording.
     ids = f"copem_replay:{appearance}", digest(experiment.model_dump_json(), replay.scene.log, str(run), run_is)
-    strict = rr.strict_mode()
-    rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
     every = configuration_colours(first)  # as in the MCAP, which has all of them
     colours = {name: every[name] for name in chosen}
+    with _streams(path, ids, replay.scene.t0_ns, viewer) as out:
+        _send_blueprint(out, panels)
+        follow(out, replay, experiment, eye)
+        _properties(out, replay, experiment, chosen, run, run_is)
+        _world(out, replay, experiment, table[of_chosen], summary, run, shown, left_out, colours)
+        if baseline is not None:  # of all objects at once: such a log is not long
+            kept = {name: first[name] for name in colours}
+            differences.differences(out, replay, experiment, kept, table[of_chosen], baseline, shown, colours)
+        told, chunks = Kept(shown), chain(iter([first]), rest)
+        del first  # one chunk's is held at a time
+        for chunk in chunks:
+            _believed(out, replay, experiment, chunk, table[of_chosen], shown, colours)
+            told.add({name: chunk[name] for name in colours})
+        _knowledge(out, replay, experiment, told.whole(), table[of_chosen], shown, colours)
+    return list(_notes(path.name, left_out, out.live))
+
+
+@contextmanager
+def _streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | None) -> Iterator[Out]:
+    """The file, and the viewer if there is one, for as long as a recording is written. Raises OutputError."""
+    import rerun as rr
+
     live = None
+    strict = rr.strict_mode()
+    rr.set_strict_mode(True)  # else a column that does not fit is left out with a warning
     try:
         with file_stream(path, *ids) as rec:
             live = Live(viewer, *ids) if viewer is not None else None
-            out = Out(rec, replay.scene.t0_ns, live)
-            rec.send_blueprint(blueprint, make_active=False)  # whoever has changed the layout keeps it
-            if live is not None:
-                live.send(lambda rec: rec.send_blueprint(blueprint, make_active=True))  # else it makes up its own
-            follow(out, replay, experiment, eye)
-            _properties(out, replay, experiment, chosen, run, run_is)
-            _world(out, replay, experiment, table[of_chosen], summary, run, shown, left_out, colours)
-            if baseline is not None:  # of all objects at once: such a log is not long
-                kept = {name: first[name] for name in colours}
-                differences.differences(out, replay, experiment, kept, table[of_chosen], baseline, shown, colours)
-            told, of_stretch = Kept(shown), chain(iter([first]), rest)
-            del first  # one stretch's is held at a time
-            for stretch in of_stretch:
-                _believed(out, replay, experiment, stretch, table[of_chosen], shown, colours)
-                told.add({name: stretch[name] for name in colours})
-            _knowledge(out, replay, experiment, told.whole(), table[of_chosen], shown, colours)
+            yield Out(rec, t0_ns, live)
     finally:
         rr.set_strict_mode(strict)
         if live is not None:
             live.close()
-    said = []
+
+
+def _send_blueprint(out: Out, panels: rrb.Blueprint) -> None:
+    """To the file so that a layout changed by the user stays, to a viewer so that its own heuristics do not apply."""
+    out.rec.send_blueprint(panels, make_active=False)
+    if out.live is not None:
+        out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
+
+
+def _notes(name: str, left_out: Sequence[str], live: Live | None) -> Iterator[str]:
     if left_out:
-        said.append(
-            f"{path.name}: without {', '.join(left_out)}; `show: {{configurations: […]}}` chooses up to {VIEWED}"
-        )
+        yield f"{name}: without {', '.join(left_out)}; `show: {{configurations: […]}}` chooses up to {VIEWED}"
     if live is not None and live.gone:
-        said.append(f"{path.name}: the viewer at {viewer} went before it had everything; the file is complete")
-    return said
+        yield f"{name}: the viewer at {live.url} went before it had everything; the file is complete"
 
 
 def _world(
@@ -128,26 +130,26 @@ def _world(
     import rerun as rr
 
     scene = replay.scene
-    out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, world.names_and_colours(scene))
-    words.differences(out, replay, table, shown, left_out)
-    words.summary(out, replay, experiment, summary, run, left_out)
-    words.legend(out)
-    words.onsets(out, scene, table)
-    world.statics(out, replay.placed.static)
-    world.lane_boundaries(out, replay.lane_boundaries)
-    units.units(out, replay, experiment)
-    marks.onsets(out, replay, experiment, table, shown)
-    world.truth(out, scene, replay.truth, shown)
+    out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
+    text_panels.differences(out, replay, table, shown, left_out)
+    text_panels.summary(out, replay, experiment, summary, run, left_out)
+    text_panels.legend(out)
+    text_panels.onsets(out, scene, table)
+    boxes.statics(out, replay.placed.static)
+    boxes.lane_boundaries(out, replay.lane_boundaries)
+    sensors.units(out, replay, experiment)
+    event_markers.onsets(out, replay, experiment, table, shown)
+    boxes.truth(out, scene, replay.truth, shown)
     for name, colour in colours.items():
-        words.events(out, scene, name, table[table["configuration"] == name])
-        marks.detections(out, replay, experiment, table, name, shown, colour)
+        text_panels.events(out, scene, name, table[table["configuration"] == name])
+        event_markers.detections(out, replay, experiment, table, name, shown, colour)
     rows = replay.rows_of(np.array(shown, dtype=np.int64))
     for k in shown:
-        curves = share_curves(replay, experiment, rows, k)
-        plots.visible_share(out, scene.object_ids[k], curves)
-        marks.on_curves(out, replay, experiment, table, scene.object_ids[k], curves, colours)
+        shares = share_curves(replay, experiment, rows, k)
+        curves.visible_share(out, scene.object_ids[k], shares)
+        event_markers.on_curves(out, replay, experiment, table, scene.object_ids[k], shares, colours)
     if len(replay.looks.object_ix):
-        plots.known(out, replay, "truth", replay.truth)
+        curves.known(out, replay, "truth", replay.truth)
 
 
 def _knowledge(
@@ -160,12 +162,12 @@ def _knowledge(
     for name, colour in colours.items():
         clock = clock_of(replay.scene, table, name)
         made[name] = status_of(replay, experiment, name, beliefs[name], seen, clock)
-        knowledge.words(out, name, replay, experiment, seen, made[name], clock)
-        knowledge.hiding(out, name, seen, made[name])
+        status_drawing.words(out, name, replay, experiment, seen, made[name], clock)
+        status_drawing.hiding(out, name, seen, made[name])
         asked = experiment.configurations[name]
-        knowledge.listings(out, name, replay, experiment, asked, beliefs[name], seen, colour)
+        status_drawing.listings(out, name, replay, experiment, asked, beliefs[name], seen, colour)
     if shown:  # their onsets and ends are the same in all configurations
-        knowledge.lanes(out, replay.scene, seen, made, colours, clock)
+        status_drawing.lanes(out, replay.scene, seen, made, colours, clock)
 
 
 def _believed(
@@ -174,12 +176,12 @@ def _believed(
 ) -> None:  # fmt: skip
     """What each configuration knew in a stretch, and how far off that was."""
     for name, colour in colours.items():
-        world.believed(out, ["world", part_of(name)], replay.scene, beliefs[name], colour)
-        plots.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
+        boxes.believed(out, ["world", part_of(name)], replay.scene, beliefs[name], colour)
+        curves.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
         if len(replay.looks.object_ix):
-            plots.gospas(out, replay, experiment, name, beliefs[name], colour)
+            curves.gospas(out, replay, experiment, name, beliefs[name], colour)
             since_ns = clock_of(replay.scene, table, name).known_ns
-            plots.known(out, replay, name, beliefs[name].fused, colour, since_ns)
+            curves.known(out, replay, name, beliefs[name].fused, colour, since_ns)
 
 
 def _properties(

@@ -18,9 +18,9 @@ from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.pipeline.log_replay import prepare, replay_block
 from copem_replay.pipeline.selected_runs import STEM, OneRun, one_run
 from copem_replay.results.compare.comparable import check_comparable
+from copem_replay.results.compare.inputs import read_folders
 from copem_replay.results.compare.labels import Named, chosen, named
-from copem_replay.results.folder import Results, load_results
-from copem_replay.results.folders import Folder, read_folders
+from copem_replay.results.read import Results, complete
 from copem_replay.results.reread import read_again
 from copem_replay.viewer.merge_experiments import Part, merged
 
@@ -64,11 +64,10 @@ def write_beside(
     read = read_folders(folders)
     check_comparable(read)
     wanted = chosen(named(read), configurations, baseline)
-    used = list(dict.fromkeys(one.folder for one in wanted))
-    results = {folder: load_results(folder.path) for folder in used}
-    log, number = _which(results[used[0]], list(results.values()), log, run)
-    sides = [_side(results[folder], [one for one in wanted if one.folder is folder], log, number) for folder in used]
-    parts = [Part(folder.name, side.one.experiment, side.labels) for folder, side in zip(used, sides, strict=True)]
+    used = [complete(results) for results in dict.fromkeys(one.results for one in wanted)]
+    log, number = _which(used[0], used, log, run)
+    sides = [_side(results, [one for one in wanted if one.results is results], log, number) for results in used]
+    parts = [Part(side.results.name, side.one.experiment, side.labels) for side in sides]
     experiment = merged(parts)
     experiment = experiment.model_copy(
         update={"configurations": {one.label: experiment.configurations[one.label] for one in wanted}}
@@ -91,16 +90,16 @@ def write_beside(
         run_is=f"differences to {wanted[0].label}",
         baseline=wanted[0].label,
     )
-    return [f"{path}: {line}" for line in _one_world(used, sides)]
+    return [f"{path}: {line}" for line in _one_world(sides)]
 
 
 def _which(first: Results, every: Sequence[Results], log: str | None, run: int | None) -> tuple[str, int]:
     """The log and the run, as asked for or as the first folder shows them. Raises InputError."""
-    names = [file.name for file in first.logs]
+    names = [file.name for file in first.provenance.logs]
     if log is not None and log not in names:
         raise InputError(f"--log: expected one of {', '.join(names)}, found {log!r}")
-    log = log if log is not None else next((name for name in names if name in first.run_shown), names[0])
-    number = run if run is not None else first.run_shown.get(log, 0)
+    log = log if log is not None else next((name for name in names if name in first.provenance.run_shown), names[0])
+    number = run if run is not None else first.provenance.run_shown.get(log, 0)
     runs = min(results.experiment.runs for results in every)
     if not 0 <= number < runs:
         raise InputError(f"--run: expected 0 to {runs - 1}, the runs that all folders have, found {number}")
@@ -139,7 +138,7 @@ def _summary(sides: Sequence[_Side], wanted: Sequence[Named]) -> pd.DataFrame:
     return pd.concat(tables).set_index("configuration").loc[[one.label for one in wanted]].reset_index()
 
 
-def _one_world(folders: Sequence[Folder], sides: Sequence[_Side]) -> list[str]:
+def _one_world(sides: Sequence[_Side]) -> list[str]:
     """What of the world the folders do not share: it can be shown only once."""
     first = sides[0].results
     return [

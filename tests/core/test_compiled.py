@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-import copem_replay
 from tests.helpers.experiments import TEXT, drive
 from tests.system.test_cli import Call, call, raising
 

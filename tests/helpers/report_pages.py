@@ -16,6 +16,7 @@ from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.pipeline.run import run
 from copem_replay.results.write import write_results
+from copem_replay.viewer.export import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 TEXT = """\
@@ -77,7 +78,7 @@ def replayed(place: Path, text: str = TEXT, *logs: str) -> Path:
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused + found
-    write_results(place / "results", experiment, recordings, run(experiment, recordings))
+    write_results(place / "results", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
     return place / "results"
 
 

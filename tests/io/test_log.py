@@ -142,7 +142,7 @@ class Failing(io.FileIO):
 def test_a_disk_that_fails_is_no_damage(path, monkeypatch):
     """It is not taken for a recording that ends early."""
     write_recording(path, FRAMES)
-    monkeypatch.setattr(container, "_File", type("OnIt", (container._File, Failing), {}))
+    monkeypatch.setattr(log, "_File", type("OnIt", (log._File, Failing), {}))
     assert problem(path) == "cannot be read: Input/output error"
 
 

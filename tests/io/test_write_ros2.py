@@ -28,6 +28,7 @@ from copem_replay.io.write.message_family import family_of
 from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
 from copem_replay.pipeline.run import run
 from copem_replay.results.write import write_results
+from copem_replay.viewer.export import EXPORTERS
 from tests.helpers.recordings import SHARED, Obj, ns, write_recording
 
 TRACKED = """\
@@ -394,7 +395,7 @@ def folder_of(path: Path) -> tuple[Recording, Path]:
     experiment, found = problems(source)
     assert experiment is not None, found
     recordings = read_logs(experiment, log_paths(source)[0], source)[0]
-    write_results(path.parent / "out", experiment, recordings, run(experiment, recordings))
+    write_results(path.parent / "out", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
     return recordings[0], path.parent / "out" / "replay.mcap"
 
 

@@ -49,6 +49,7 @@ from copem_replay.report.figures.selection import choose
 from copem_replay.report.figures.style import appearances
 from copem_replay.report.figures.timeline import Event
 from copem_replay.results.write import write_results
+from copem_replay.viewer.export import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 TEXT = """\
@@ -101,7 +102,9 @@ def replayed(place: Path, text: str = TEXT, name: str = "results") -> Path:
     assert experiment is not None, found
     recordings, refused = read_logs(experiment, log_paths(source)[0], source)
     assert not refused + found
-    write_results(place / name, experiment, recordings, run(experiment, recordings), overwrite=True)
+    write_results(
+        place / name, experiment, recordings, run(experiment, recordings), exporters=EXPORTERS, overwrite=True
+    )
     return place / name
 
 

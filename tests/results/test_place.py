@@ -176,7 +176,7 @@ class TestOneWriter:
     def test_two_processes(self, here: Path) -> None:
         """The first stands still until the second has ended; and then is done."""
         code = (
-            "import sys\nfrom copem_replay import cli, run\n"
+            "import sys\nfrom copem_replay.cli import main as cli\nfrom copem_replay.pipeline import run\n"
             "replay = run.run\n"
             "def waits(*a, **k):\n    print('now', flush=True)\n    sys.stdin.readline()\n    return replay(*a, **k)\n"
             "run.run = waits\nsys.argv = ['copem-replay', 'run', 'e.yaml']\ncli.main()\n"
@@ -457,17 +457,17 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
 def test_tables_of_old_and_new_results_are_not_read_as_one(
     old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from copem_replay.results import folders
+    from copem_replay.results import read
 
-    experiment = folders._experiment
+    load = read.load
     replaced = iter([True])
 
     def meanwhile(path: Path) -> Any:
         if next(replaced, False):
             assert again(call).code == 0
-        return experiment(path)
+        return load(path)
 
-    monkeypatch.setattr(folders, "_experiment", meanwhile)
+    monkeypatch.setattr(read, "load", meanwhile)
     ended = call("compare", "out/e", "--baseline", "GT")
     assert (ended.code, ended.lines[-1]) == (
         2,

@@ -23,6 +23,7 @@ from copem_replay.pipeline import log_replay as replays
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
 from copem_replay.results.write import write_results
+from copem_replay.viewer.export import EXPORTERS
 from tests.helpers import scenes
 from tests.helpers.recordings import Obj, write_recording
 from tests.helpers.scenes import experiment
@@ -97,7 +98,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     assert not refused
     result = run(chosen, recordings)
     folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, result)
+    write_results(folder, chosen, recordings, result, exporters=EXPORTERS)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert names == {
         "experiment.yaml", "provenance.json", "detections.parquet", "summary.csv",
@@ -137,7 +138,7 @@ def test_without_accuracy_nothing_tells_of_it(two_logs: list[Path], tmp_path: Pa
     chosen = plan(show=None, measure={"accuracy": False})
     recordings, _ = read_logs(chosen, two_logs, None)
     folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, run(chosen, recordings))
+    write_results(folder, chosen, recordings, run(chosen, recordings), exporters=EXPORTERS)
     assert {path.name for path in folder.iterdir()} == {
         "experiment.yaml", "provenance.json", "detections.parquet", "summary.csv",
     }  # fmt: skip
@@ -167,7 +168,7 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
     )  # fmt: skip
     recordings, _ = read_logs(chosen, two_logs, None)
     folder = tmp_path / "out"
-    write_results(folder, chosen, recordings, run(chosen, recordings, jobs=2))
+    write_results(folder, chosen, recordings, run(chosen, recordings, jobs=2), exporters=EXPORTERS)
 
     def read(name: str) -> list[dict[str, Any]]:
         return parquet.read_table(folder / f"{name}.parquet").to_pylist()
@@ -297,7 +298,7 @@ def test_several_runs_of_several_logs(two_logs: list[Path], tmp_path: Path) -> N
     result = run(chosen, recordings)
     folder = tmp_path / "out"
     for _ in range(2):  # what is there already goes
-        write_results(folder, chosen, recordings, result, overwrite=True)
+        write_results(folder, chosen, recordings, result, exporters=EXPORTERS, overwrite=True)
     stems = ["replay", "replay_best", "replay_1"]
     files = {f"{stem}/{log}/drive.{kind}" for stem in stems for log in ("near", "far") for kind in ("mcap", "rrd")}
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("replay*/**/*") if p.is_file()} == files

@@ -16,6 +16,7 @@ from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.pipeline.run import run
 from copem_replay.results.write import write_results
+from copem_replay.viewer.export import EXPORTERS
 from tests.io.test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +36,7 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
     once = experiment.model_copy(update={"runs": 1})
     recordings, _ = read_logs(once, log_paths(source)[0], source)
     folder = tmp_path_factory.mktemp("layout") / "tc016d"
-    write_results(folder, once, recordings, run(once, recordings))
+    write_results(folder, once, recordings, run(once, recordings), exporters=EXPORTERS)
     return folder / "replay.mcap"
 
 
@@ -121,7 +122,7 @@ def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
     experiment, wrong = problems(source)
     assert experiment is not None, wrong
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
-    write_results(tmp_path / "out", experiment, recordings, run(experiment, recordings))
+    write_results(tmp_path / "out", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
     panels = layout_of(tmp_path / "out/replay.mcap")["configById"].values()
     assert [panel["foxglovePanelTitle"] for panel in panels] == ["GT", "PEM", "coPEM", "gnn"]
     assert {panel["followTf"] for panel in panels} == {"square"}

@@ -188,7 +188,7 @@ class TestRefusals:
         (tmp_path / "drive.mcap").rename(tmp_path / "aside.mcap")
         code, (line,) = call(*asked)
         assert code == 2
-        assert "drive.mcap: cannot be read: No such file or directory; put the log back" in line
+        assert "drive.mcap: cannot be opened: No such file or directory; put the log back" in line
         drive(tmp_path / "drive.mcap", first=5)
         code, (line,) = call(*asked)
         assert code == 2

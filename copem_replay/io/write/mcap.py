@@ -20,13 +20,13 @@ import pandas as pd
 from mcap.records import Message
 from mcap.writer import Writer
 
-from copem_replay.core.colours import configuration_colours
+from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.tracks import SAME_INSTANT_NS, Scene, Tracks
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
-from copem_replay.io.write.message_family import OSI_CHANNEL, Family, ListWriter, Osi, osi_version, topics_of
+from copem_replay.io.write.message_family import OSI_CHANNEL, Family, ListWriter, Opened, Osi, osi_version, topics_of
 from copem_replay.io.write.pass_through import Catalogue
 from copem_replay.io.write.source import Source, source_of
 
@@ -48,13 +48,15 @@ def write_mcap(
     family: Family | None = None,
     window: Window | None = None,
 ) -> list[str]:
-    """`source` with the fused lists of one run added, `beliefs` by configuration, stretch by stretch: values (1, P).
+    """Write `source` with the fused lists of one run added.
+
+    `beliefs`: one time chunk after the other, by configuration; values (1, P).
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
     `window`: of `source` that was read, None: all.
 
-    Returns what has to be said of what could not be copied, or was replaced.
+    Returns notes on what could not be copied, or was replaced.
 
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
@@ -71,23 +73,12 @@ def write_mcap(
         messages = original.messages(original.register(catalogue, without=ours))
         opened = family.open(catalogue, scene, numbers)
 
-        def lists_of(stretch: Mapping[str, Belief]) -> list[Iterator[Message]]:
-            return [
-                _lists(
-                    scene,
-                    belief.fused,
-                    opened.channels(
-                        name, belief, _events(belief.fused, table[table["configuration"] == name]), colours[name]
-                    ),
-                )
-                for name, belief in stretch.items()
-            ]
+        def lists_of(chunk: Mapping[str, Belief]) -> list[Iterator[Message]]:
+            return list(_lists_of(opened, scene, chunk, table, colours))
 
         begun = lists_of(first)  # registers the channels
         del first
-        added = chain.from_iterable(
-            _in_order(streams) for streams in chain([begun], (lists_of(stretch) for stretch in rest))
-        )
+        added = chain.from_iterable(_in_order(streams) for streams in chain([begun], (lists_of(c) for c in rest)))
         units_record = {f"unit.{number}": unit for unit, number in numbers.items()}
         for name, record in _kept(original).items():
             if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
@@ -102,6 +93,15 @@ def write_mcap(
     replaced = sorted(ours & {channel.topic for channel in original.channels.values()})
     notes = [f"{len(replaced)} topics of an earlier replay are replaced ({replaced[0]} …)"] if replaced else []
     return [*([original.damage] if original.damage else []), *notes]
+
+
+def _lists_of(
+    opened: Opened, scene: Scene, chunk: Mapping[str, Belief], table: pd.DataFrame, colours: Mapping[str, Rgb]
+) -> Iterator[Iterator[Message]]:
+    """Of each configuration the messages of one time chunk."""
+    for name, belief in chunk.items():
+        events = _events(belief.fused, table[table["configuration"] == name])
+        yield _lists(scene, belief.fused, opened.channels(name, belief, events, colours[name]))
 
 
 def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
@@ -121,7 +121,7 @@ def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]
     issue_s, tolerance_s = fused.arrives_s[0], 2e-9 * SAME_INSTANT_NS
     if not len(issue_s):
         return events
-    # The others are of other stretches.
+    # The others are of other time chunks.
     here = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
     for row in table[table["detected"] & here].to_dict("records"):
         frame = int(np.abs(issue_s - row["detection_s"]).argmin())

@@ -15,7 +15,7 @@ from copem_replay.report.figures.distances import distances_figure
 from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.write import write_figures
-from copem_replay.results.folder import Results, load_results
+from copem_replay.results.read import Results, load_results
 
 __all__ = [
     "Results",

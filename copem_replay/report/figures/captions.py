@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.text import counted
-from copem_replay.results.folder import Results
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 _LONGEST_NAME = 26
 """Letters of a configuration's name, at most (chosen)."""

@@ -21,11 +21,12 @@ from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_i
 from copem_replay.report.figures.bands import band
 from copem_replay.report.figures.captions import list_rates, short_names, study
 from copem_replay.report.figures.style import add_note, appearances, new_figure, style
-from copem_replay.results.folder import Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
 
 _NEARLY = 0.005
 """The axis ends when each curve has come this near to its last value (chosen)."""

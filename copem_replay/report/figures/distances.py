@@ -16,11 +16,12 @@ from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.report.figures.captions import list_rates, percent, short_names, study
 from copem_replay.report.figures.style import INK, Appearance, add_note, appearances, new_figure, style
-from copem_replay.results.folder import Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
 
 _OBJECT, _CONFLICT = "distance_at_detection_m", "distance_at_conflict_detection_m"
 _WORDS = {_OBJECT: "Distance at detection (m)", _CONFLICT: "Distance when the collision is foreseen (m)"}

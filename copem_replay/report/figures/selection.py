@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError
-from copem_replay.results.folder import Results
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 _COLUMNS = 4
 """Runs side by side unless configurations are named (chosen: the paper's)."""
@@ -53,7 +56,7 @@ def choose(
     log, object_id = str(first["log"].iloc[0]), str(first["object_id"].iloc[0])
     rows = rows[(rows["log"] == log) & (rows["object_id"] == object_id)]
     if run is None:
-        run = results.run_shown.get(log, int(rows["run"].min()))
+        run = results.provenance.run_shown.get(log, int(rows["run"].min()))
     if run not in rows["run"].to_numpy():
         raise InputError(f"{where}: run: expected {rows['run'].min()} to {rows['run'].max()}, found {run}")
     return Choice(log, object_id, run, named if configurations else worst_to_best(rows, named))

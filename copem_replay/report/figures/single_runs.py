@@ -20,12 +20,13 @@ from copem_replay.report.figures.selection import Choice, choose
 from copem_replay.report.figures.style import FAINT, INK, Appearance, add_note, appearances, new_figure, style
 from copem_replay.report.figures.timeline import Story, row_of, story
 from copem_replay.report.figures.trajectories import braked_course, free_course
-from copem_replay.results.folder import Results
 from copem_replay.results.reread import reread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
 
 _WIDTH_IN, _HEIGHT_IN = 2.15, 1.25
 """Size of a panel, about."""

@@ -16,12 +16,13 @@ from copem_replay.core.text import interval_words
 from copem_replay.core.tracks import Float
 from copem_replay.report.figures.captions import list_rates, short_names
 from copem_replay.report.figures.style import Appearance, add_note, appearances, new_figure, style
-from copem_replay.results.folder import Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+
+    from copem_replay.results.read import Results
 
 _BEYOND_S = 1e9
 """Stands for never where a band is drawn: above every axis (chosen)."""

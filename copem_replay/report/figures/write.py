@@ -18,10 +18,11 @@ from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.figures.style import style
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.results.belongings import check_still
-from copem_replay.results.folder import Results
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
 
 _FIGURES = ("runs", "distances", "curves", "sweeps")
 _METADATA = {

@@ -48,7 +48,7 @@ def page(study: Study) -> str:
             sections.append(_section(f"figures-{k}", title, *above, html))
         sections.append(_section("missed", "Never detected", never_detected(study), without_a_draw(study)))
     sections.append(_section("provenance", "Where this comes from", provenance(study)))
-    title = f"When was it known? {', '.join(file.name for file in study.results.logs)}"
+    title = f"When was it known? {', '.join(file.name for file in study.results.provenance.logs)}"
     head = tag("header", tag("h1", "When was it known?"), tag("p", question(study), class_="question"), answer(study))
     return _whole(title, joined([head, *sections]), figures)
 

@@ -33,7 +33,7 @@ def together(names: Sequence[str]) -> str:
 
 def logs(study: Study) -> str:
     """Which recordings."""
-    names = [file.name for file in study.results.logs]
+    names = [file.name for file in study.results.provenance.logs]
     window = study.results.experiment.window_s
     part = ""
     if window is not None and window != (None, None):

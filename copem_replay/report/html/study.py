@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from copem_replay.core.text import unknown
 from copem_replay.report.figures.style import Appearance, appearances
 from copem_replay.results.compare import Comparison, compare
 from copem_replay.results.compare.labels import DEFAULT_BASELINE
-from copem_replay.results.folder import Results, load_results
+from copem_replay.results.read import Results, load_results
 
 _COLUMNS = (
     "detected_share", "interval", "interval_over", "ttd_median_s", "ttd_rmst_s", "ttd_rmst_horizon_s", "dad_median_m",
@@ -34,11 +34,15 @@ class Study:
     """
 
     results: Results
-    provenance: dict[str, Any]
     baseline: str | None
     regret: Comparison | None
     best: str | None
     lead: Comparison | None
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """The whole of `provenance.json`."""
+        return self.results.provenance.data
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -66,16 +70,15 @@ def load_study(folder: Path, baseline: str | None = None) -> Study:
     That is by default `ideal`, else the first configuration that is not the truth. Raises InputError.
     """
     results = load_results(folder, rowless=True)
-    provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
     _check_summary(results)
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:
         raise InputError(f"--baseline: {unknown('configuration', baseline, names)}")
     if not len(results.table):
-        return Study(results, provenance, None, None, None, None)
+        return Study(results, None, None, None, None)
     best = _soonest(results)
     if len(names) < 2:
-        return Study(results, provenance, None, None, best, None)
+        return Study(results, None, None, best, None)
     contenders = _contenders(results)
     against = baseline or (DEFAULT_BASELINE if DEFAULT_BASELINE in names else contenders[0])
     regret = compare([folder], baseline=against)
@@ -86,7 +89,7 @@ def load_study(folder: Path, baseline: str | None = None) -> Study:
             if best == against and contenders == names
             else compare([folder], configurations=contenders, baseline=best)
         )
-    return Study(results, provenance, against, regret, best, lead)
+    return Study(results, against, regret, best, lead)
 
 
 def _check_summary(results: Results) -> None:

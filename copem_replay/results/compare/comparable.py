@@ -4,65 +4,68 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from copem_replay.core.errors import InputError
-from copem_replay.results.folders import Folder
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 _MEASURE = ("objects", "onset", "count_earlier", "confirm", "match", "distance_to", "horizon_s", "gospa")
 """Keys of `measure` that the compared metrics depend on."""
 
 
-def check_comparable(folders: Sequence[Folder]) -> None:
+def check_comparable(folders: Sequence[Results]) -> None:
     """Raise InputError, a line for every reason why a folder cannot be compared with the first."""
     problems = [problem for other in folders[1:] for problem in _problems(folders[0], other)]
     if problems:
         raise InputError(problems)
 
 
-def _problems(first: Folder, other: Folder) -> Iterator[str]:
+def _problems(first: Results, other: Results) -> Iterator[str]:
     yield from _logs(first, other)
+    before, after = first.provenance, other.provenance
     for key in ("seed", "window_s", "max_gap_s"):
-        yield from _differs(first, other, key, getattr(first, key), getattr(other, key))
+        yield from _differs(first, other, key, getattr(before, key), getattr(after, key))
     # As written: whom `null` stands for is in the logs.
-    yield from _differs(first, other, "ego", first.ego, other.ego)
+    yield from _differs(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
     for key in _MEASURE:
-        yield from _differs(first, other, f"measure.{key}", first.measure.get(key), other.measure.get(key))
-    onset = first.measure.get("onset")
+        yield from _differs(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
+    onset = before.measure.get("onset")
     if isinstance(onset, dict) and str(onset.get("kind")).startswith("line_of_sight"):
-        yield from _differs(first, other, "visibility", first.visibility, other.visibility)
-    if first.braking is not None and other.braking is not None:
-        yield from _differs(first, other, "braking", first.braking, other.braking)
-        if first.braking.get("brakes_for") == other.braking.get("brakes_for") == "conflict":
+        yield from _differs(first, other, "visibility", before.visibility, after.visibility)
+    if before.braking is not None and after.braking is not None:
+        yield from _differs(first, other, "braking", before.braking, after.braking)
+        if before.braking.get("brakes_for") == after.braking.get("brakes_for") == "conflict":
             of = "measure.conflict"
-            yield from _differs(first, other, of, first.measure.get("conflict"), other.measure.get("conflict"))
+            yield from _differs(first, other, of, before.measure.get("conflict"), after.measure.get("conflict"))
 
 
-def _differs(first: Folder, other: Folder, key: str, expected: object, found: object) -> Iterator[str]:
+def _differs(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
     if expected != found:
-        yield f"{other.path}: {key}: expected {_brief(expected)} as in {first.path}, found {_brief(found)}"
+        yield f"{other.folder}: {key}: expected {_brief(expected)} as in {first.folder}, found {_brief(found)}"
 
 
 def _brief(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _logs(first: Folder, other: Folder) -> Iterator[str]:
+def _logs(first: Results, other: Results) -> Iterator[str]:
     """Other recordings; or the same by another name or another truth, of which the draws and objects differ."""
-    expected, found = ({log.sha256: log.name for log in folder.logs} for folder in (first, other))
+    expected, found = ({log.sha256: log.name for log in folder.provenance.logs} for folder in (first, other))
     missing, more = ([a[sha] for sha in a if sha not in b] for a, b in ((expected, found), (found, expected)))
     if missing or more:
         lacks = [f"{', '.join(missing)} missing"] if missing else []
         other_ones = [f"{', '.join(more)} of other content (SHA-256)"] if more else []
-        yield f"{other.path}: expected the logs of {first.path}, found {' and '.join(lacks + other_ones)}"
+        yield f"{other.folder}: expected the logs of {first.folder}, found {' and '.join(lacks + other_ones)}"
         return
-    names, other_names = (sorted(log.name for log in folder.logs) for folder in (first, other))
+    names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
     if names != other_names or expected != found:
         yield (
-            f"{other.path}: expected the logs to be named as in {first.path}, {', '.join(names)}, found "
+            f"{other.folder}: expected the logs to be named as in {first.folder}, {', '.join(names)}, found "
             f"{', '.join(other_names)}: draws are by the log's name"
         )
         return
-    topics, other_topics = ({log.name: log.topic for log in folder.logs} for folder in (first, other))
+    topics, other_topics = ({log.name: log.topic for log in folder.provenance.logs} for folder in (first, other))
     for name, topic in topics.items():
         yield from _differs(first, other, f"log {name}: topic", topic, other_topics[name])

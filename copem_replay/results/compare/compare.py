@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from copem_replay.results.compare.bootstrap import Draws, Whose
 from copem_replay.results.compare.comparable import check_comparable
 from copem_replay.results.compare.configuration_data import Side, side_of
 from copem_replay.results.compare.equal_ghosts import notes_on_equal_ghosts, why_not
+from copem_replay.results.compare.inputs import read_folders
 from copem_replay.results.compare.labels import Named, chosen, named
 from copem_replay.results.compare.limits import limits
 from copem_replay.results.compare.metrics import Regret, Setting, own_rate, regrets
@@ -28,7 +30,9 @@ from copem_replay.results.compare.notes import (
 )
 from copem_replay.results.compare.paired_statistics import mcnemar
 from copem_replay.results.compare.pairing import Grid, grid_of
-from copem_replay.results.folders import Folder, read_folders
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 ALL = "all"
 """What stands for the log in figures of all logs."""
@@ -97,10 +101,10 @@ def compare(
     check_comparable(read)
     grid = grid_of(read)
     against, *others = chosen(named(read), configurations, baseline)
-    used = list(dict.fromkeys(one.folder for one in (against, *others)))
+    used = list(dict.fromkeys(one.results for one in (against, *others)))
     second = side_of(against, grid)
     setting = _setting(read, second, ghosts_per_min)
-    draws = Draws(read[0].seed)
+    draws = Draws(read[0].provenance.seed)
     rows: list[dict[str, object]] = []
     sides: list[Side] = []
     reasons: dict[str, str | None] = {}
@@ -112,7 +116,7 @@ def compare(
         pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
         reasons[one.label] = why_not(
             first, second, setting.ghosts_per_min, asked=ghosts_per_min is not None,
-            truth=against.configuration in against.folder.truth,
+            truth=against.configuration in against.results.truth,
         )  # fmt: skip
         mine = setting if reasons[one.label] is None else replace(setting, ghosts_per_min=None)
         for regret in regrets(first, second, grid, mine):
@@ -139,12 +143,12 @@ def compare(
     )
 
 
-def _setting(folders: Sequence[Folder], baseline: Side, ghosts_per_min: float | None) -> Setting:
+def _setting(folders: Sequence[Results], baseline: Side, ghosts_per_min: float | None) -> Setting:
     """What holds for all pairs; the longest look is that of any folder."""
-    measure = folders[0].measure
+    measure = folders[0].provenance.measure
     horizon_s = measure["horizon_s"]
     if horizon_s is None:
-        used_s = [folder.horizon_used_s for folder in folders if folder.horizon_used_s is not None]
+        used_s = [one.provenance.horizon_used_s for one in folders if one.provenance.horizon_used_s is not None]
         horizon_s = max(used_s) if used_s else float(np.nanmax(baseline.ended_s - baseline.onset_s))
     if ghosts_per_min is None and baseline.ghosts is not None:
         ghosts_per_min = own_rate(baseline.ghosts)
@@ -153,7 +157,7 @@ def _setting(folders: Sequence[Folder], baseline: Side, ghosts_per_min: float | 
 
 def _check_same_looks(one: Named, first: Side, against: Named, second: Side, grid: Grid) -> None:
     """Raise InputError where an object is not looked at from and until the same time: no pair then is one."""
-    if one.folder is against.folder:
+    if one.results is against.results:
         return
     both = first.there & second.there
     for what in ("onset_s", "ended_s"):
@@ -162,16 +166,16 @@ def _check_same_looks(one: Named, first: Side, against: Named, second: Side, gri
         if len(other):
             log, _, name = grid.objects[grid.object_of[other[0]]].partition("\n")
             raise InputError(
-                f"{one.folder.path}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
-                f"{against.folder.path}, found {found[other[0]]:g}: not the same ego, recording or units"
+                f"{one.results.folder}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
+                f"{against.results.folder}, found {found[other[0]]:g}: not the same ego, recording or units"
             )
 
 
 def _fixed(metric: str, *sides: Named) -> bool:
     """Whether a metric is the same in every run, with all of them."""
     if metric == "pass_share":
-        return all(side.folder.fixed.passes(side.configuration) for side in sides)
-    return all(side.folder.fixed.known(side.configuration) for side in sides)
+        return all(side.results.fixed.passes(side.configuration) for side in sides)
+    return all(side.results.fixed.known(side.configuration) for side in sides)
 
 
 def _rows(regret: Regret, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool) -> Iterator[dict[str, object]]:

@@ -81,23 +81,23 @@ def side_of(one: Named, grid: Grid) -> Side:
     """Lay a configuration out. Raises InputError where its tables are damaged or don't go together."""
     import pyarrow.compute as pc
 
-    folder = one.folder
+    results = one.results
     mine = {
-        name: table.filter(pc.equal(table["configuration"], one.configuration)) for name, table in folder.tables.items()
+        name: table.filter(pc.equal(table["configuration"], one.configuration)) for name, table in results.arrow.items()
     }
     rows = mine["detections.parquet"]
     cell = grid.cells(rows)
-    place = folder.path / "detections.parquet"
+    place = results.folder / "detections.parquet"
     _check_once(place, cell, one.configuration)
     detected = flag(rows["detected"])
     for name, wanted in (("onset_s", True), ("ended_s", True), ("detection_s", detected)):
         if (np.isnan(number(rows[name])) & wanted).any():
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {_AGAIN}")
-    braking = folder.braking is not None
+    braking = results.provenance.braking is not None
     size = len(grid.object_of)
     return Side(
         label=one.label,
-        path=folder.path,
+        path=results.folder,
         there=_laid(np.ones(len(cell), dtype=bool), cell, size),
         detected=_laid(detected, cell, size),
         left=_laid(_is_left(rows), cell, size),
@@ -107,8 +107,8 @@ def side_of(one: Named, grid: Grid) -> Side:
         distance_m=_laid(number(rows["distance_at_detection_m"]), cell, size),
         conflict=_laid(flag(rows["conflict"]), cell, size) if braking else None,
         passes=_laid(flag(rows["braking_pass"]), cell, size) if braking else None,
-        accuracy=_accuracy(folder.path, mine, cell, grid),
-        ghosts=_ghosts(folder.path / "lists.parquet", mine, grid, one.configuration),
+        accuracy=_accuracy(results.folder, mine, cell, grid),
+        ghosts=_ghosts(results.folder / "lists.parquet", mine, grid, one.configuration),
         steps=_steps(mine, grid),
     )
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.text import unknown
-from copem_replay.results.folders import Folder
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 DEFAULT_BASELINE = "ideal"
 """With this configuration the others are compared, if there is one and nothing else is said."""
@@ -18,25 +21,31 @@ DEFAULT_BASELINE = "ideal"
 class Named:
     """A configuration of a folder, and what it is called: its name, with the folder's where that is not enough."""
 
-    folder: Folder
+    results: Results
     configuration: str
     label: str
 
     def is_meant_by(self, name: str) -> bool:
         """Whether a name stands for it (and perhaps for others, too)."""
-        return name in (self.label, self.configuration, f"{self.folder.name}:{self.configuration}")
+        return name in (self.label, self.configuration, f"{self.results.name}:{self.configuration}")
 
 
-def named(folders: Sequence[Folder]) -> list[Named]:
+def named(folders: Sequence[Results]) -> list[Named]:
     """All configurations of all folders, each by a label of its own."""
-    found = [Named(folder, name, name) for folder in folders for name in folder.configurations()]
-    for prefix in (lambda folder: folder.name, lambda folder: str(folder.path)):
+    found = [Named(folder, name, name) for folder in folders for name in _configurations(folder)]
+    for prefix in (lambda folder: folder.name, lambda folder: str(folder.folder)):
         times = Counter(one.label for one in found)
         found = [
-            replace(one, label=f"{prefix(one.folder)}:{one.configuration}") if times[one.label] > 1 else one
+            replace(one, label=f"{prefix(one.results)}:{one.configuration}") if times[one.label] > 1 else one
             for one in found
         ]
     return found
+
+
+def _configurations(results: Results) -> list[str]:
+    """Names of the configurations that have rows, in their order."""
+    names: list[str] = results.arrow["detections.parquet"]["configuration"].unique().to_pylist()
+    return names
 
 
 def chosen(known: Sequence[Named], configurations: Sequence[str] | None, baseline: str | None) -> tuple[Named, ...]:

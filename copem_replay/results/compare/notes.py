@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -12,7 +13,10 @@ from copem_replay.metrics.summary import FEWEST_CLUSTERS
 from copem_replay.results.compare.configuration_data import Side
 from copem_replay.results.compare.labels import Named
 from copem_replay.results.compare.per_list import shared_instants
-from copem_replay.results.folders import OPTIONAL, Folder
+from copem_replay.results.tables import OPTIONAL
+
+if TYPE_CHECKING:
+    from copem_replay.results.read import Results
 
 _NEEDED = {
     "position_rmse_m": {"accuracy.parquet", "instants.parquet"},
@@ -22,24 +26,23 @@ _NEEDED = {
 }
 
 
-def notes_on_folders(folders: Sequence[Folder]) -> Iterator[str]:
+def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
     """What folders do not have, or have more of than others."""
-    runs = {str(folder.path): folder.runs for folder in folders}
+    runs = {str(folder.folder): folder.provenance.runs for folder in folders}
     if len(set(runs.values())) > 1:
         has = ", ".join(f"{path} {count}" for path, count in runs.items())
         yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
     for folder in folders:
-        missing = [name for name in OPTIONAL if name not in folder.tables]
+        missing = [name for name in OPTIONAL if name not in folder.arrow]
         metrics = [metric for metric, files in _NEEDED.items() if files & set(missing)]
         if metrics:
             yield (
-                f"{folder.path}: no {', '.join(missing)} (without accuracy, with units that only some runs have, or of "
-                f"an older version): not compared: "
-                f"{', '.join(metrics)}"
+                f"{folder.folder}: no {', '.join(missing)} (without accuracy, with units that only some runs have, or "
+                f"of an older version): not compared: {', '.join(metrics)}"
             )
-    with_braking = [folder for folder in folders if folder.braking is not None]
+    with_braking = [folder for folder in folders if folder.provenance.braking is not None]
     if with_braking and len(with_braking) < len(folders):
-        without = ", ".join(str(folder.path) for folder in folders if folder.braking is None)
+        without = ", ".join(str(folder.folder) for folder in folders if folder.provenance.braking is None)
         yield f"{without}: no braking: pass_share is compared only among those that have it"
 
 
@@ -73,7 +76,7 @@ def notes_on_instants(baseline: Side, others: Sequence[Side], logs: Sequence[str
 
 def note_on_measuring(baseline: Named, others: Sequence[Named]) -> Iterator[str]:
     """Who detects by truth id where the others have to be matched."""
-    by_id = [one for one in (baseline, *others) if one.configuration in one.folder.by_truth_id]
+    by_id = [one for one in (baseline, *others) if one.configuration in one.results.by_truth_id]
     if by_id and len(by_id) <= len(others):
         yield (
             f"{', '.join(one.label for one in by_id)}: detected by truth id, the others by match within the gate "

@@ -15,10 +15,11 @@ import numpy as np
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.results.folders import Folder
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from copem_replay.results.read import Results
 
 
 @dataclass(frozen=True)
@@ -70,23 +71,23 @@ class Grid:
         return np.tile(np.arange(self.runs), len(self.objects))
 
 
-def grid_of(folders: Sequence[Folder]) -> Grid:
+def grid_of(folders: Sequence[Results]) -> Grid:
     """The grid of several folders. Raises InputError where there is no row at all."""
     import pyarrow.compute as pc
 
-    logs = tuple(log.name for log in folders[0].logs)
+    logs = tuple(log.name for log in folders[0].provenance.logs)
     objects: dict[str, None] = {}
     for folder in folders:
-        objects |= dict.fromkeys(pc.unique(_object_keys(folder.detections)).to_pylist())
-        if unknown := set(folder.detections["log"].unique().to_pylist()) - set(logs):
+        objects |= dict.fromkeys(pc.unique(_object_keys(folder.arrow["detections.parquet"])).to_pylist())
+        if unknown := set(folder.arrow["detections.parquet"]["log"].unique().to_pylist()) - set(logs):
             raise InputError(
-                f"{folder.path}/detections.parquet: expected the logs of provenance.json, found {min(unknown)!r}"
+                f"{folder.folder}/detections.parquet: expected the logs of provenance.json, found {min(unknown)!r}"
             )
     if not objects:
-        raise InputError(f"{folders[0].path}: expected rows to compare, found none: no measured object has an onset")
+        raise InputError(f"{folders[0].folder}: expected rows to compare, found none: no measured object has an onset")
     number = {name: k for k, name in enumerate(logs)}
     log_ix = np.array([number[key.partition("\n")[0]] for key in objects], dtype=np.int64)
-    return Grid(logs, tuple(objects), log_ix, min(folder.runs for folder in folders))
+    return Grid(logs, tuple(objects), log_ix, min(folder.provenance.runs for folder in folders))
 
 
 def _object_keys(table: pa.Table) -> pa.ChunkedArray:

@@ -1,0 +1,62 @@
+"""Exporters: each writes one shown run of one log as a file of its own kind. They are handed to `write_results`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.selected_runs import OneRun, ShownRun
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class RunToExport:
+    """One run of one log, in the configurations that are shown.
+
+    `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and runs. `manifest`: what
+    made the file.
+    """
+
+    recording: Recording
+    shown: ShownRun
+    one: OneRun
+    table: pd.DataFrame
+    summary: pd.DataFrame
+    manifest: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A kind of file. `suffix`: with the dot. `write`: writes the file and returns notes for the user.
+
+    `write` raises OutputError where the file cannot be written, and RecordingError where the recording cannot be read.
+    """
+
+    suffix: str
+    write: Callable[[Path, RunToExport], list[str]]
+
+
+def _write_mcap(path: Path, run: RunToExport) -> list[str]:
+    from copem_replay.io.write.mcap import write_mcap
+    from copem_replay.io.write.message_family import family_of
+
+    recording = run.recording
+    return write_mcap(
+        path,
+        recording.path,
+        run.one.replay.scene,
+        run.one.beliefs,
+        run.table,
+        run.manifest,
+        family_of(recording),
+        recording.window,
+    )
+
+
+MCAP = Exporter(".mcap", _write_mcap)
+"""The recording with the fused lists added, as MCAP."""

@@ -1,0 +1,275 @@
+"""A results folder, read back: one reader for figures, reports, recordings and comparisons."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.core.tracks import TRUTH
+from copem_replay.experiment.file import Source, load, parse
+from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.config import Measure
+from copem_replay.metrics.fixed import Fixed, fixed_in
+from copem_replay.results.belongings import MARK, check_still
+from copem_replay.results.tables import (
+    AGAIN,
+    BRAKING,
+    CONFLICT,
+    DETECTIONS,
+    EXACT,
+    OPTIONAL,
+    ROWS,
+    VERDICTS,
+    is_rowless,
+    read_arrow,
+    read_csv,
+    read_frame,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content."""
+
+    name: str
+    topic: str | None
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """`provenance.json`. `measure` has every default filled in. `data`: the whole file."""
+
+    logs: tuple[LogFile, ...]
+    seed: int
+    runs: int
+    visibility: str | None
+    max_gap_s: float | None
+    window_s: object
+    measure: dict[str, Any]
+    braking: dict[str, Any] | None
+    horizon_used_s: float | None
+    run_shown: dict[str, int]  # by log
+    data: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """A results folder. Its files are read when they are first asked for, which raises InputError where one is damaged
+    or is by now that of other results.
+    """
+
+    folder: Path
+    seen: os.stat_result  # the folder when it was opened
+    provenance: Provenance
+
+    @property
+    def name(self) -> str:
+        """The name of the folder, also where it is given as `.`."""
+        return self.folder.resolve().name
+
+    @cached_property
+    def source(self) -> Source:
+        """`experiment.yaml` as plain data."""
+        try:
+            source = load(self.folder / "experiment.yaml")
+        except ExperimentError as error:
+            why = error.problems[0].removeprefix(f"{self.folder / 'experiment.yaml'}:").strip()
+            raise InputError(
+                f"{self.folder / 'experiment.yaml'}: expected the experiment of the results, found damage: {why}; "
+                f"{AGAIN}"
+            ) from None
+        check_still(self.folder, self.seen)
+        return source
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """The experiment, with components of the user's own."""
+        experiment, problems = parse(self.source)
+        if experiment is None or problems:
+            raise InputError(problems)
+        return experiment
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """`detections.parquet`."""
+        experiment = self.experiment
+        columns = ROWS + (BRAKING if experiment.braking else ()) + (CONFLICT if experiment.measure.conflict else ())
+        return self._frame("detections.parquet", columns)
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """`summary.csv`."""
+        return self._frame("summary.csv", ("configuration", "n", "list_rate_hz"))
+
+    @cached_property
+    def exact(self) -> pd.DataFrame | None:
+        """`exact.parquet`; None: there is no such file."""
+        return self._frame("exact.parquet", EXACT) if (self.folder / "exact.parquet").is_file() else None
+
+    @cached_property
+    def sweep(self) -> pd.DataFrame | None:
+        """`sweep.csv`; None: there is no such file."""
+        columns = ("sweep", "value", "configuration", "list_rate_hz")
+        return self._frame("sweep.csv", columns) if (self.folder / "sweep.csv").is_file() else None
+
+    @cached_property
+    def arrow(self) -> dict[str, pa.Table]:
+        """The tables that comparisons read, by file name, those that are there."""
+        place = self.folder / "detections.parquet"
+        if is_rowless(place):
+            raise InputError(
+                f"{self.folder}: nobody was measured, so nothing can be compared: no measured object has an onset"
+            )
+        tables = {place.name: read_arrow(place, DETECTIONS | (VERDICTS if self.provenance.braking is not None else {}))}
+        there = {name: columns for name, columns in OPTIONAL.items() if (self.folder / name).is_file()}
+        tables |= {name: read_arrow(self.folder / name, columns) for name, columns in there.items()}
+        check_still(self.folder, self.seen)
+        return tables
+
+    @cached_property
+    def fixed(self) -> Fixed:
+        """What is the same in every run."""
+        return fixed_in(self.source.data)
+
+    @cached_property
+    def by_truth_id(self) -> frozenset[str]:
+        """Configurations that detect by truth id: the truth, and ideal fusion."""
+        if self.provenance.measure["match"].get("always"):
+            return frozenset()
+        return frozenset(name for name, said in self._configurations if _knows_ids(said))
+
+    @cached_property
+    def truth(self) -> frozenset[str]:
+        """Configurations that are the truth."""
+        return frozenset(name for name, said in self._configurations if said.get("units") == TRUTH)
+
+    @property
+    def _configurations(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """What `experiment.yaml` says of each configuration, as plain data."""
+        said = self.source.data.get("configurations")
+        for name, one in said.items() if isinstance(said, dict) else ():
+            if isinstance(one, dict):
+                yield str(name), one
+
+    def log_path(self, log: str) -> Path:
+        """Where the recording of a log is expected."""
+        number = [file.name for file in self.provenance.logs].index(log)
+        return self.folder / self.experiment.logs[number]
+
+    def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
+        """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""
+        known = tuple(self.experiment.configurations)
+        for name in configurations or ():
+            if name not in known:
+                raise InputError(f"{self.folder}: configurations: expected some of {', '.join(known)}, found {name!r}")
+        return tuple(dict.fromkeys(configurations)) if configurations else known
+
+    def _frame(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
+        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else pd.read_parquet, columns)
+        check_still(self.folder, self.seen)
+        return table
+
+
+def open_results(folder: Path | str, *more: str) -> Results:
+    """A results folder of which nothing but the provenance is read yet.
+
+    `more`: files that have to be there besides what every comparison needs. Raises InputError, one line: no such
+    folder, no results, or a damaged provenance.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: expected a results folder, found {found}; `copem-replay run` writes one")
+    _check_there(folder, MARK, "experiment.yaml", "detections.parquet", *more)
+    seen = os.stat(folder)
+    return Results(folder, seen, _provenance(folder / MARK))
+
+
+def _check_there(folder: Path, *names: str) -> None:
+    for name in names:
+        if not (folder / name).is_file():
+            raise InputError(
+                f"{folder}: expected a results folder, found no {name} in it; `copem-replay run` writes one"
+            )
+
+
+def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
+    """Read a results folder whole, without rows only if `rowless`.
+
+    Raises InputError, one line: no such folder, no results, or damaged ones.
+    """
+    return complete(open_results(folder, "summary.csv"), rowless=rowless)
+
+
+def complete(results: Results, *, rowless: bool = False) -> Results:
+    """The same, with every table read and held against the experiment. Raises InputError."""
+    _check_there(results.folder, "summary.csv")
+    if len(results.table) or not rowless:
+        _check(results.folder, results.table, results.experiment)
+    expected, found = len(results.experiment.logs), len(results.provenance.logs)
+    if expected != found:
+        raise InputError(
+            f"{results.folder}/{MARK}: expected {expected} logs as in experiment.yaml, found {found}; {AGAIN}"
+        )
+    for name in ("summary", "exact", "sweep"):
+        getattr(results, name)
+    return results
+
+
+def _check(folder: Path, table: pd.DataFrame, experiment: Experiment) -> None:
+    """Raise InputError where the rows are of another experiment, are not all there, or there are none."""
+    place = folder / "detections.parquet"
+    unknown = [name for name in table["configuration"].unique() if name not in experiment.configurations]
+    if unknown:
+        raise InputError(f"{place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
+    if not len(table):
+        raise InputError(f"{place}: expected rows to draw, found none: no measured object has an onset")
+    counts = [int((table["configuration"] == name).sum()) for name in experiment.configurations]
+    if min(counts) != max(counts):
+        raise InputError(
+            f"{place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
+        )
+
+
+def _provenance(path: Path) -> Provenance:
+    """Read `provenance.json`. Raises InputError."""
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+        logs = tuple(LogFile(str(log["log"]), log.get("topic"), str(log["sha256"])) for log in data["logs"])
+        measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
+        used_s, run_shown = measure.pop("horizon_used_s", None), data.get("run_shown") or {}
+        return Provenance(
+            logs=logs,
+            seed=int(data["seed"]),
+            runs=int(data["runs"]),
+            visibility=data.get("visibility"),
+            max_gap_s=None if gap_s is None else float(gap_s),
+            window_s=data.get("window_s"),
+            # A key that an older version did not have stood for its default.
+            measure=Measure().model_dump(mode="json", by_alias=True) | measure,
+            braking=None if braking is None else dict(braking),
+            horizon_used_s=None if used_s is None else float(used_s),
+            run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
+            data=data,
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {AGAIN}") from None
+
+
+def _knows_ids(configuration: dict[str, Any]) -> bool:
+    """Whether a configuration needs no match with the truth to know an object."""
+    fusion = configuration.get("fusion")
+    return fusion is None or bool(fusion.get("kind", "ideal") == "ideal")

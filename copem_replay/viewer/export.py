@@ -1,0 +1,32 @@
+"""One shown run of a results folder as a Rerun recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from copem_replay.results.export import MCAP, Exporter, RunToExport
+
+
+def rrd_to(viewer: str | None) -> Exporter:
+    """The exporter of `.rrd` files that also sends each recording to the Rerun viewer at this address, if any."""
+
+    def write(path: Path, run: RunToExport) -> list[str]:
+        from copem_replay.viewer.rrd import write_rrd
+
+        return write_rrd(
+            path,
+            run.one.replay,
+            run.one.experiment,
+            run.one.beliefs,
+            run.table,
+            run.summary,
+            run.shown.run,
+            run_is=run.shown.why,
+            viewer=viewer,
+        )
+
+    return Exporter(".rrd", write)
+
+
+EXPORTERS = (MCAP, rrd_to(None))
+"""Both kinds of files that `copem-replay run` writes of a shown run."""
