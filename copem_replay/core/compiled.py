@@ -12,9 +12,16 @@ import stat
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
+
+
+@cache
+def cache_note() -> str | None:
+    """Prepare the place for compiled code, once. Returns what has to be said of it: None, nothing."""
+    return prepare_cache(Path(__file__).parents[1])
 
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
@@ -36,12 +43,8 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
 
 
 def _folders(package: Path) -> list[str]:
-    """The package, and the packages in it."""
-    with os.scandir(package) as entries:
-        return [
-            str(package),
-            *(entry.path for entry in entries if entry.is_dir() and os.path.exists(f"{entry.path}/__init__.py")),
-        ]
+    """The package, and all packages in it."""
+    return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
 
 
 def _writable(folder: str | None) -> bool:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot
+from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, described
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
 from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
@@ -205,14 +205,23 @@ def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None
     return window_s
 
 
+def _as_file(schema: dict[str, Any]) -> None:
+    """A file has to name its logs; only an experiment that is made in Python may leave them out."""
+    described(schema)
+    del schema["properties"]["logs"]["default"]
+    schema["required"].insert(1, "logs")
+
+
 class Experiment(Frozen):
     """An experiment file.
 
     `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
     """
 
+    model_config = ConfigDict(json_schema_extra=_as_file)
+
     version: Annotated[Literal[1], BeforeValidator(_version)]
-    logs: Annotated[tuple[str, ...], Field(min_length=1)]
+    logs: Annotated[tuple[str, ...], Field(min_length=1)] = ()
     read: HowRead = Read()
     ego: Ego | None = None
     window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None

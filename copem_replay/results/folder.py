@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,32 @@ class Results:
     def name(self) -> str:
         """What the study is called: as its folder."""
         return self.folder.resolve().name
+
+    @property
+    def detections(self) -> pd.DataFrame:
+        """A row per log, configuration, run and measured object."""
+        return self.table
+
+    @cached_property
+    def accuracy(self) -> pd.DataFrame | None:
+        """Position errors and parts of GOSPA, list by list, in the order of `detections`; None: not measured."""
+        file = self.folder / "accuracy.parquet"
+        return _read(file, pd.read_parquet, ()) if file.is_file() else None
+
+    @cached_property
+    def bands(self) -> pd.DataFrame | None:
+        """Accuracy by configuration and by distance, time or existence; None: not measured."""
+        file = self.folder / "bands.csv"
+        return _read(file, _csv, ("configuration", "by", "from", "to")) if file.is_file() else None
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What had to be said of the recordings and of the runs: one line each."""
+        file = self.folder / "provenance.json"
+        try:
+            return tuple(map(str, json.loads(file.read_text(encoding="utf-8"))["notes"]))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{file}: expected the notes of the results, found damage: {error}; {_AGAIN}") from None
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""

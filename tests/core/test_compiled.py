@@ -17,7 +17,7 @@ from tests.system.test_cli import Call, call, raising
 
 __all__ = ["call"]  # a fixture
 
-PACKAGE = Path(compiled.__file__).parent
+PACKAGE = Path(compiled.__file__).parents[1]
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -26,8 +26,8 @@ def sealed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the package, beside whose files nothing can be cached, not even by root: that is a file."""
     folder = tmp_path_factory.mktemp("sealed")
     shutil.copytree(PACKAGE, folder / "copem_replay", ignore=shutil.ignore_patterns("__pycache__"))
-    for place in [folder / "copem_replay", *(path.parent for path in (folder / "copem_replay").glob("*/__init__.py"))]:
-        (place / "__pycache__").touch()
+    for path in (folder / "copem_replay").rglob("__init__.py"):
+        (path.parent / "__pycache__").touch()
     return folder
 
 
@@ -61,7 +61,7 @@ def test_a_folder_of_the_users_own_under_the_temporary_one(run: Run, sealed: Pat
         ended = run("check", "e.yaml")
         assert (ended.returncode, ended.stderr) == (0, note(sealed, str(folder)))
         assert folder.stat().st_mode & 0o777 == 0o700
-        assert any(path.name.startswith("copem_replay_") for path in folder.iterdir()), "Numba's, for the package"
+        assert any(path.name.startswith("core_") for path in folder.iterdir()), "Numba's, for the package"
     assert run("--help").stderr == "", "nothing is compiled"
 
 

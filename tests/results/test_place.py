@@ -176,7 +176,7 @@ class TestOneWriter:
     def test_two_processes(self, here: Path) -> None:
         """The first stands still until the second has ended; and then is done."""
         code = (
-            "import sys\nfrom copem_replay import cli, run\n"
+            "import sys\nfrom copem_replay.cli import main as cli\nfrom copem_replay.pipeline import run\n"
             "replay = run.run\n"
             "def waits(*a, **k):\n    print('now', flush=True)\n    sys.stdin.readline()\n    return replay(*a, **k)\n"
             "run.run = waits\nsys.argv = ['copem-replay', 'run', 'e.yaml']\ncli.main()\n"
