@@ -52,6 +52,9 @@ class Unit(Placement):
     """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
     One whose lists are recorded has no PEM, and needs a place only where distances are measured from it.
+
+    >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
+    True
     """
 
     recorded: Recorded | None = None
@@ -76,7 +79,12 @@ class Unit(Placement):
 
 
 class Configuration(Frozen):
-    """What is compared: which units, which fusion, which latency."""
+    """What is compared: which units, which fusion, which latency.
+
+    >>> late = cr.Configuration(units="all", latency_s={"ego": 0.0, "default": 0.15}, fusion={"kind": "gnn"})
+    >>> late.latency_of("mast"), late.fusion.kind
+    (0.15, 'gnn')
+    """
 
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
@@ -216,6 +224,10 @@ class Experiment(Frozen):
     """An experiment file.
 
     `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
+
+    >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
+    >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
+    (50, 0)
     """
 
     model_config = ConfigDict(json_schema_extra=_as_file)

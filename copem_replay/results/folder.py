@@ -37,7 +37,12 @@ class LogFile:
 
 @dataclass(frozen=True)
 class Results:
-    """A results folder. `exact`, `sweep`: None where it has no such file."""
+    """A results folder. `exact`, `sweep`: None where it has no such file.
+
+    >>> results = cr.load_results("out/tc016d")
+    >>> results.name, results.experiment.runs, results.sweep is None
+    ('tc016d', 500, True)
+    """
 
     folder: Path
     source: Source  # experiment.yaml as plain data

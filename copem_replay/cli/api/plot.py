@@ -68,7 +68,7 @@ def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) 
 
     >>> cr.plot.sweeps("out/tc016d")
     Traceback (most recent call last):
-    copem_replay.core.errors.InputError: out/tc016d: no sweep.csv
+    copem_replay.core.errors.InputError: out/tc016d: expected sweep.csv in it, found none; ...
     """
     from copem_replay.report.figures import sweeps_figure
 

@@ -46,7 +46,7 @@ def read_recording(
 
     >>> recording = cr.read_recording("logs/tc016d.mcap", window_s=(0, 2))
     >>> len(recording.scene.object_ids), recording.truth.x_m.shape
-    (29, (1, 609))
+    (9, (1, 189))
     """
     from copem_replay.io.log import name_of
     from copem_replay.io.recording import read
@@ -95,7 +95,7 @@ def draft_experiment(path: AnyPath) -> str:
     Raises RecordingError where no list of true objects is readable, or the path of the recording is not UTF-8.
 
     >>> print(cr.draft_experiment("logs/tc016d.mcap").splitlines()[0])
-    # tc016d.mcap
+    # Replays tc016d.mcap, 8.0 s: 2 pedestrian, 1 bicycle, 4 car, 1 truck.
     """
     text, found = draft_of(Path(path))
     if text is None:

@@ -37,7 +37,7 @@ class StudyResult:
 
     >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
     >>> result.detections.shape[0], result.exact is None
-    (1, True)
+    (7, True)
     """
 
     experiment: Experiment
@@ -162,8 +162,8 @@ def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run:
 
     >>> fused = cr.fused_tracks("logs/tc016d.yaml", "logs/tc016d.mcap", run=3)["coPEM:1s"]
     >>> fused.to_dataframe()[["available_s", "object_id", "x_m"]].head(1)
-       available_s object_id    x_m
-    0          1.0       ego -34.25
+       available_s object_id       x_m
+    0          1.0         2  0.221615
     """
     from copem_replay.pipeline.selected_runs import one_run
 
@@ -184,7 +184,7 @@ def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> p
 
     >>> seen = cr.observations("logs/tc016d.yaml", "logs/tc016d.mcap").query("unit == 'ego'")
     >>> seen.loc[seen["since_onset_s"].between(0.55, 0.75), "visible_share"].round(2).tolist()
-    [0.22, 0.52]
+    [0.18, 0.37]
     """
     from copem_replay.pipeline.log_replay import prepare
 
