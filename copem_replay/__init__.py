@@ -1,3 +1,158 @@
-"""Replay of recorded traffic through (cooperative) perception error models."""
+"""Replay of recorded traffic through (cooperative) perception error models.
 
-from copem_replay.core import compiled as _compiled  # noqa: F401 (prepares the cache, before Numba is imported)
+    import copem_replay as cr
+
+    result = cr.run("experiment.yaml")
+    result.summary
+    result.save("out/experiment")
+
+A name is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib as _importlib
+from typing import TYPE_CHECKING
+
+from copem_replay.core.compiled import cache_note as _cache_note
+
+if TYPE_CHECKING:
+    from copem_replay.cli.api import plot
+    from copem_replay.cli.api.recordings import (
+        draft_experiment,
+        inspect_recording,
+        read_lists,
+        read_recording,
+        read_recordings,
+    )
+    from copem_replay.cli.api.results import compare, load_results, view, write_report
+    from copem_replay.cli.api.run import StudyResult, fused_tracks, observations, run
+    from copem_replay.cli.api.study import load_experiment
+    from copem_replay.core.errors import (
+        CopemError,
+        EmptyWindowError,
+        ExperimentError,
+        InputError,
+        OutputError,
+        RecordingError,
+    )
+    from copem_replay.core.fused_tracks import Belief as FusedTracks
+    from copem_replay.core.object_list import Lists as ObjectLists
+    from copem_replay.core.object_list import Reports as Inputs
+    from copem_replay.core.object_list import entries_of
+    from copem_replay.core.tracks import CLASSES, Scene, Tracks
+    from copem_replay.core.view_geometry import Errors
+    from copem_replay.core.view_geometry import Look as ViewGeometry
+    from copem_replay.experiment.schema import Configuration, Experiment, Unit
+    from copem_replay.fusion.base import Inbox, ListFusion, StepFusion
+    from copem_replay.fusion.testing.check import RULES as FUSION_RULES
+    from copem_replay.fusion.testing.check import NonconformingError, check_fusion
+    from copem_replay.io.recording import Recording
+    from copem_replay.metrics.braking.driver import Driver, Reaction
+    from copem_replay.metrics.config import Measure, Onset
+    from copem_replay.metrics.gospa import gospa, ospa
+    from copem_replay.metrics.survival import cumulative_incidence
+    from copem_replay.perception.pem.detection import DetectionModel
+    from copem_replay.perception.pem.error import ErrorModel
+    from copem_replay.results.compare import Comparison
+    from copem_replay.results.read import Results
+
+__all__ = [
+    "CLASSES",
+    "FUSION_RULES",
+    "Comparison",
+    "Configuration",
+    "CopemError",
+    "DetectionModel",
+    "Driver",
+    "EmptyWindowError",
+    "ErrorModel",
+    "Errors",
+    "Experiment",
+    "ExperimentError",
+    "FusedTracks",
+    "Inbox",
+    "InputError",
+    "Inputs",
+    "ListFusion",
+    "Measure",
+    "NonconformingError",
+    "ObjectLists",
+    "Onset",
+    "OutputError",
+    "Reaction",
+    "Recording",
+    "RecordingError",
+    "Results",
+    "Scene",
+    "StepFusion",
+    "StudyResult",
+    "Tracks",
+    "Unit",
+    "ViewGeometry",
+    "check_fusion",
+    "compare",
+    "cumulative_incidence",
+    "draft_experiment",
+    "entries_of",
+    "fused_tracks",
+    "gospa",
+    "inspect_recording",
+    "load_experiment",
+    "load_results",
+    "observations",
+    "ospa",
+    "plot",
+    "read_lists",
+    "read_recording",
+    "read_recordings",
+    "run",
+    "view",
+    "write_report",
+]
+
+_PLACES = {
+    "cli.api": "plot",
+    "cli.api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
+    "cli.api.results": "compare load_results view write_report",
+    "cli.api.run": "StudyResult fused_tracks observations run",
+    "cli.api.study": "load_experiment",
+    "core.errors": "CopemError EmptyWindowError ExperimentError InputError OutputError RecordingError",
+    "core.fused_tracks": "FusedTracks=Belief",
+    "core.object_list": "ObjectLists=Lists Inputs=Reports entries_of",
+    "core.tracks": "CLASSES Scene Tracks",
+    "core.view_geometry": "Errors ViewGeometry=Look",
+    "experiment.schema": "Configuration Experiment Unit",
+    "fusion.base": "Inbox ListFusion StepFusion",
+    "fusion.testing.check": "FUSION_RULES=RULES NonconformingError check_fusion",
+    "io.recording": "Recording",
+    "metrics.braking.driver": "Driver Reaction",
+    "metrics.config": "Measure Onset",
+    "metrics.gospa": "gospa ospa",
+    "metrics.survival": "cumulative_incidence",
+    "perception.pem.detection": "DetectionModel",
+    "perception.pem.error": "ErrorModel",
+    "results.compare": "Comparison",
+    "results.read": "Results",
+}
+"""By module the names it gives; `public=private` where it has another one."""
+_MODULE = {
+    name: (f"{__name__}.{module}", own or name)
+    for module, names in _PLACES.items()
+    for name, _, own in (entry.partition("=") for entry in names.split())
+}
+
+_cache_note()  # before Numba is imported
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, own = _MODULE[name]
+    if name == "plot":
+        return _importlib.import_module(f"{module}.{name}")
+    return getattr(_importlib.import_module(module), own)
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

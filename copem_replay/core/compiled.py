@@ -12,9 +12,16 @@ import stat
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
+
+
+@cache
+def cache_note() -> str | None:
+    """Prepare the place for compiled code, once. Returns what has to be said of it: None, nothing."""
+    return prepare_cache(Path(__file__).parents[1])
 
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
@@ -36,7 +43,7 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
 
 
 def _folders(package: Path) -> list[str]:
-    """The package, and the packages in it, however deep."""
+    """The package, and all packages in it."""
     return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
 
 
@@ -66,7 +73,3 @@ def _own_folder() -> tuple[str, str]:
     mine = tempfile.mkdtemp(prefix=f"copem_replay-{os.geteuid()}-")
     atexit.register(shutil.rmtree, mine, ignore_errors=True)
     return mine, f" for this process alone ({folder} is not a folder of this user alone)"
-
-
-CACHE_NOTE = prepare_cache(Path(__file__).parents[1])
-"""What has to be said of where compiled code is cached: None, nothing."""

@@ -33,10 +33,16 @@ from copem_replay.core.own_code import FAILURES, failed, is_own, written_at
 T = TypeVar("T")
 
 
+def described(schema: dict[str, Any]) -> None:
+    """Leave the examples for Python out of the descriptions of a JSON Schema."""
+    if "description" in schema:
+        schema["description"] = schema["description"].partition("\n\n>>> ")[0]
+
+
 class Frozen(BaseModel):
     """Base of all models: immutable, and a key that is not known is refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=described)
 
 
 class Component(Frozen):

@@ -23,6 +23,13 @@ class CopemError(Exception):
     """Base of all errors that are not defects.
 
     `problems` holds one line each: where, what was expected, what was found, what to do.
+
+    >>> try:
+    ...     cr.load_experiment({"version": 1, "runs": 0})
+    ... except cr.CopemError as error:
+    ...     print(error)
+    experiment: runs: expected at least 1, found 0
+    experiment: configurations: missing
     """
 
     def __init__(self, problems: str | Sequence[str]) -> None:
@@ -32,11 +39,21 @@ class CopemError(Exception):
 
 
 class InputError(CopemError):
-    """What was given is wrong."""
+    """The input is wrong: an experiment, a recording, results, or an argument.
+
+    >>> cr.load_results("nowhere")
+    Traceback (most recent call last):
+    copem_replay.core.errors.InputError: nowhere: expected a results folder, found no such folder; ...
+    """
 
 
 class ExperimentError(InputError):
-    """An experiment file is wrong."""
+    """An experiment is wrong, or does not fit its recordings.
+
+    >>> cr.load_experiment("nowhere.yaml")
+    Traceback (most recent call last):
+    copem_replay.core.errors.ExperimentError: nowhere.yaml: no such file
+    """
 
 
 class RecordingError(InputError):
@@ -44,6 +61,10 @@ class RecordingError(InputError):
 
     Each of `problems` reads `path: topic: reason`. `path`: the file or folder, `topic`: where in it, `reasons`: what is
     wrong, a line each, without either. `key`: the key of an experiment file that asks in vain, () where none does.
+
+    >>> cr.read_recording("logs/tc016d.mcap", ego="99")
+    Traceback (most recent call last):
+    copem_replay.core.errors.RecordingError: logs/tc016d.mcap: ego: no moving object '99'; there are 1 (car), ...
     """
 
     _about: str | None = None
@@ -80,8 +101,18 @@ class EgoError(RecordingError):
 
 
 class EmptyWindowError(RecordingError):
-    """Nothing of a recording is in the window that was asked for."""
+    """The window holds no message of the truth.
+
+    >>> cr.read_recording("logs/tc016d.mcap", window_s=(60, None))
+    Traceback (most recent call last):
+    copem_replay.core.errors.EmptyWindowError: logs/tc016d.mcap: ...
+    """
 
 
 class OutputError(CopemError):
-    """A result cannot be written where it was asked for."""
+    """A result cannot be written to its place.
+
+    >>> cr.write_report("out/tc016d", "report.pdf")
+    Traceback (most recent call last):
+    copem_replay.core.errors.OutputError: report.pdf: expected a name that ends with .html or .htm, found report.pdf
+    """

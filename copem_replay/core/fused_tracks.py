@@ -4,22 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numba as nb
 import numpy as np
 
 from copem_replay.core.agree import most_probable_of_each
 from copem_replay.core.object_list import Entries
-from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.core.view_geometry import Look
+
+if TYPE_CHECKING:  # it takes long to import
+    import pandas as pd
 
 
 @dataclass(frozen=True)
 class Belief:
-    """What the receiver believes, and which entries of the units' lists each fused row was made of.
+    """The fused lists as tracks, and the entries of the units' lists that each fused row (P,) is made of.
 
-    Of what goes by lists without truth only the rows are known, not what they were made of: `said` is then what the
-    fusion says of each row (P,), in one run, and a track's `object_ix` the true object it is matched with, −1: none.
+    Fusions without truth ids give the rows alone: `said` (P,) then holds the entries of the fusion, in one run, and
+    `object_ix` of a track the true object it is matched with, −1: none.
+
+    >>> fused = cr.fused_tracks("logs/tc016d.yaml", "logs/tc016d.mcap")["PEM"]
+    >>> fused.fused.valid.sum() == len(fused.to_dataframe())
+    np.True_
     """
 
     fused: Tracks
@@ -28,6 +36,36 @@ class Belief:
     start: Int  # (P + 1,) where the entries of each fused row begin
     look: Look | None = None  # how the rows of `heard` look from their units; the truth needs none
     said: Entries | None = None
+    scene: Scene | None = None  # of the log, where rows are to be named
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """The entries of all lists of one run, in the order of the lists.
+
+        `available_s`: when the receiver has the list. `captured_s`: the newest capture that contributed. `object_id`:
+        the true object, null where a false positive is matched with none; `track_id`: of the fusion, −1: none.
+        `object_class`: as `class_of`. State and position covariance as in `Tracks`; `existence`: null where not said.
+        Raises ValueError for tracks of several runs, or without a scene to name objects by.
+        """
+        import pandas as pd
+
+        if self.scene is None or len(self.fused.valid) != 1:
+            raise ValueError("to_dataframe: expected the tracks of one run, with their scene")
+        order = self.fused.by_frame[0]
+        rows = order[self.fused.valid[0, order]]
+        ids = np.array([*self.scene.object_ids, None], dtype=object)  # −1 is the last
+        said = self.said
+        columns: dict[str, object] = {
+            "available_s": self.fused.arrives_s[0, self.fused.frame_ix[rows]],
+            "captured_s": self.captured_s[0, rows],
+            "object_id": ids[self.fused.row_object_ix[rows]],
+            "track_id": np.full(len(rows), -1) if said is None else said["track_id"][rows],
+            "object_class": np.array(CLASSES, dtype=object)[self.class_of(self.scene)[rows]],
+            "existence": np.full(len(rows), np.nan) if said is None else said["existence"][rows],
+        }
+        for name in (*VALUES, "cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
+            values = getattr(self.fused, name)
+            columns[name] = np.zeros(len(rows)) if values is None else values[0, rows]
+        return pd.DataFrame(columns)
 
     @cached_property
     def used(self) -> Int:

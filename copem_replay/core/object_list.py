@@ -48,7 +48,16 @@ TellsOf = Literal["capture", "now"]
 
 
 def entries_of(count: int) -> Entries:
-    """A list of `count` entries with nothing in them: zeros, no unit, no track."""
+    """Make a list of `count` entries that hold zeros, no unit and no track: a NumPy array (N,) with named columns.
+
+    Metres, radians, m/s, m²; `existence` and `class_probability` are probabilities; `captured_s` is in seconds since
+    the log's start.
+
+    >>> entries = cr.entries_of(2)
+    >>> entries["x_m"] = [10.0, 20.0]
+    >>> entries[entries["x_m"] > 15]["track_id"]
+    array([-1])
+    """
     entries = np.zeros(count, dtype=ENTRY)
     entries["unit_ix"] = entries["track_id"] = -1
     return entries
@@ -59,6 +68,10 @@ class Lists:
     """Lists of S runs: list k of run s is `entries[start[s, k] : start[s, k + 1]]`, in no order that means anything.
 
     `start (S, K + 1)`, `entries (N,)`.
+
+    >>> lists = cr.ObjectLists(np.array([[0, 2, 3]]), cr.entries_of(3))
+    >>> len(lists.of(run=0, number=1))
+    1
     """
 
     start: Int
@@ -75,7 +88,14 @@ class Reports:
     """All lists of all units, when the receiver has each, and the instants at which it issues a fused list.
 
     List f is the same capture of the same unit in all runs; what is in it differs from run to run. Entries of one list
-    are in a random order that is the same however the recording was ordered.
+    are in a random order that is the same however the recording was ordered. Times are seconds since the log's start.
+    They are what `ListFusion.fuse` is handed.
+
+    >>> none = np.zeros(0, dtype=int)
+    >>> lists = cr.ObjectLists(np.array([[0]]), cr.entries_of(0))
+    >>> inputs = cr.Inputs(("ego",), none, none, none, lists, np.array([0.0]), np.array([[-1]]), none, np.array([0, 0]))
+    >>> inputs.newest[0].tolist()
+    [-1]
     """
 
     units: tuple[str, ...]  # U

@@ -70,6 +70,10 @@ class Scene:
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen.
+
+    >>> scene = cr.read_recording("logs/tc016d.mcap").scene
+    >>> scene.object_ids[scene.ego_ix], cr.CLASSES[scene.object_class[scene.ego_ix]], scene.end_s
+    ('1', 'car', 8.0)
     """
 
     log: str
@@ -99,6 +103,11 @@ class Tracks:
     Rows of a track are in order of capture, `start[e]:start[e + 1]`; a track has at least one row. NaN may lie
     under `valid == False` and nowhere else. Covariances are None where states are exact.
     Raises ValueError when a shape is wrong: that is a defect of the caller, never of a recording.
+
+    >>> scene, truth = (recording := cr.read_recording("logs/tc016d.mcap")).scene, recording.truth
+    >>> of_ego = truth.row_object_ix == scene.ego_ix
+    >>> truth.vx_mps[0, of_ego].mean().round(2)
+    np.float64(10.0)
     """
 
     units: tuple[str, ...]  # U names; the truth has the one unit TRUTH

@@ -16,7 +16,14 @@ Noise = Callable[[str], Float]
 
 @dataclass(frozen=True)
 class Look:
-    """How each candidate row looks from its unit. All (P,); nothing here depends on the run."""
+    """How each candidate row looks from its unit. All (P,); nothing here depends on the run.
+
+    `observations` gives the same as a table.
+
+    >>> view = cr.ViewGeometry(*np.full((10, 3), 0.5))
+    >>> view.take(np.array([0, 2])).visible_share
+    array([0.5, 0.5])
+    """
 
     range_m: Float  # horizontal, from the unit's place to the centre of the box
     azimuth_rad: Float  # to the centre of the box, from the unit's heading, (−π, π]
@@ -39,6 +46,10 @@ class Errors:
     """What an error model adds to the true state. Offsets (S, P), variances (P,); None: exact.
 
     Position in easting and northing. Size is one offset for each of length, width and height: (3, S, P).
+
+    >>> offsets, variances = np.zeros((4, 3)), np.ones(3)
+    >>> cr.Errors(offsets, offsets, variances, 0 * variances, variances).yaw_rad is None
+    True
     """
 
     east_m: Float

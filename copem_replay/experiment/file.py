@@ -39,6 +39,11 @@ class Source:
     logs: tuple[str, ...] = ()  # to replay instead of those it names, relative to where we are
     options: Mapping[Key, str] = field(default_factory=dict)  # of the command line: keys that they have set
 
+    @property
+    def logs_option(self) -> str:
+        """What `logs` were given by."""
+        return self.options.get(("logs",), "--log")
+
     def at(self, key: Key, message: str, line: int | None = None) -> str:
         """`file:line: key: message`; by default the line of the key, or of what it should be in.
 
@@ -50,6 +55,21 @@ class Source:
             line = next(self.lines[key[:n]] for n in range(len(key), -1, -1) if key[:n] in self.lines)
         name = dotted(key)
         return Problem(f"{self.path}:{line}: {name + ': ' if name else ''}{message}", line)
+
+
+@dataclass(frozen=True)
+class PlainSource(Source):
+    """An experiment that is made in Python and stands in no file: it need not name its logs, and keys have no line."""
+
+    def at(self, key: Key, message: str, line: int | None = None) -> str:
+        """`experiment: key: message`; where an option set the key, `option: message`."""
+        name = self.options.get(key) or ": ".join(filter(None, (str(self.path), dotted(key))))
+        return f"{name}: {message}"
+
+
+def plain(data: Mapping[str, Any]) -> PlainSource:
+    """The plain data of an experiment as a source. Paths of its logs are relative to the working folder."""
+    return PlainSource(Path("experiment"), dict(data), {(): 1}, ())
 
 
 def dotted(key: Key) -> str:
@@ -93,9 +113,17 @@ def parse(source: Source) -> tuple[Experiment | None, list[str]]:
     try:
         experiment = Experiment.model_validate(source.data)
     except ValidationError as error:
-        problems += _problems(source, error)
-        return None, problems
-    return experiment, problems
+        found = list(_problems(source, error))
+        first = sum(line == source.at(("version",), "missing") for line in found)  # in the order of the keys
+        return None, [*problems, *found[:first], *_logs_missing(source), *found[first:]]
+    missing = _logs_missing(source)
+    return (None if missing else experiment), problems + missing
+
+
+def _logs_missing(source: Source) -> list[str]:
+    """That a file names no logs; they are optional in Python only."""
+    given = "logs" in source.data or isinstance(source, PlainSource)
+    return [] if given else [source.at(("logs",), "missing")]
 
 
 def _problems(source: Source, error: ValidationError) -> Iterator[str]:
@@ -237,7 +265,7 @@ def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
     for pattern in source.logs:
         found = matching(pattern, Path())
         paths |= dict.fromkeys(found)
-        problems += [] if found else [f"--log: no file matches {pattern!r}"]
+        problems += [] if found else [f"{source.logs_option}: no file matches {pattern!r}"]
     named = source.data.get("logs")
     for k, pattern in enumerate(named if isinstance(named, list) and not source.logs else []):
         if isinstance(pattern, str):
@@ -250,7 +278,7 @@ def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
 def named_paths(source: Source) -> Iterator[tuple[str, Path]]:
     """Each recording as often as it is named, and by what: `logs[0]`, `--log`."""
     for pattern in source.logs:
-        yield from (("--log", path) for path in matching(pattern, Path()))
+        yield from ((source.logs_option, path) for path in matching(pattern, Path()))
     named = source.data.get("logs")
     for k, pattern in enumerate(named if isinstance(named, list) and not source.logs else []):
         if isinstance(pattern, str):

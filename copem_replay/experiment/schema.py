@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot
+from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, described
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
 from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
@@ -52,6 +52,9 @@ class Unit(Placement):
     """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
     One whose lists are recorded has no PEM, and needs a place only where distances are measured from it.
+
+    >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
+    True
     """
 
     recorded: Recorded | None = None
@@ -76,7 +79,12 @@ class Unit(Placement):
 
 
 class Configuration(Frozen):
-    """What is compared: which units, which fusion, which latency."""
+    """What is compared: which units, which fusion, which latency.
+
+    >>> late = cr.Configuration(units="all", latency_s={"ego": 0.0, "default": 0.15}, fusion={"kind": "gnn"})
+    >>> late.latency_of("mast"), late.fusion.kind
+    (0.15, 'gnn')
+    """
 
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
@@ -205,14 +213,27 @@ def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None
     return window_s
 
 
+def _as_file(schema: dict[str, Any]) -> None:
+    """A file has to name its logs; only an experiment that is made in Python may leave them out."""
+    described(schema)
+    del schema["properties"]["logs"]["default"]
+    schema["required"].insert(1, "logs")
+
+
 class Experiment(Frozen):
     """An experiment file.
 
     `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
+
+    >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
+    >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
+    (50, 0)
     """
 
+    model_config = ConfigDict(json_schema_extra=_as_file)
+
     version: Annotated[Literal[1], BeforeValidator(_version)]
-    logs: Annotated[tuple[str, ...], Field(min_length=1)]
+    logs: Annotated[tuple[str, ...], Field(min_length=1)] = ()
     read: HowRead = Read()
     ego: Ego | None = None
     window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None

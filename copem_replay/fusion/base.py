@@ -32,7 +32,15 @@ class Ideal(Fusion):
 
 
 class ListFusion(Fusion):
-    """Base of fusions that go by lists without truth."""
+    """Base of fusions that go by lists without truth, all runs and instants at once.
+
+    >>> class Nothing(cr.ListFusion):
+    ...     def fuse(self, reports):
+    ...         shape = (len(reports.lists.start), len(reports.issue_s) + 1)
+    ...         return cr.ObjectLists(np.zeros(shape, dtype=np.int64), cr.entries_of(0))
+    >>> Nothing(kind="my_package.fusions:Nothing").resumable
+    False
+    """
 
     resumable: ClassVar[bool] = False
     """Whether `resume` gives, stretch after stretch of the instants, the very lists of `fuse`; if not, all instants are
@@ -101,6 +109,9 @@ class Inbox:
 
     `newest`: each unit's newest list, if it is not older than `max_age_s` (in the order of the experiment's units).
     `arrived`: the lists that arrive at this very instant, in order of capture; old ones that come late are among them.
+
+    >>> cr.Inbox(newest=(), arrived=()).newest
+    ()
     """
 
     newest: tuple[UnitList, ...]
@@ -108,7 +119,14 @@ class Inbox:
 
 
 class StepFusion(ListFusion):
-    """Base of fusions in plain Python: one instant at a time. Derive your own from this."""
+    """Base of fusions in plain Python: one instant at a time. Derive your own from this.
+
+    >>> class Newest(cr.StepFusion):
+    ...     def step(self, now_s, inbox, memory):
+    ...         return np.concatenate([cr.entries_of(0), *(one.entries for one in inbox.newest[:1])]), memory
+    >>> Newest(kind="my_package.fusions:Newest").step(0.0, cr.Inbox((), ()), None)[0].shape
+    (0,)
+    """
 
     resumable: ClassVar[bool] = True
 

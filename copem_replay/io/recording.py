@@ -42,6 +42,10 @@ class Recording:
 
     `truth` has the one unit TRUTH, one run, and arrives as it is captured. `host_id` is the host vehicle as
     the log names it, whether or not there is such an object; `scene.ego_ix` is −1 where there is none.
+
+    >>> recording = cr.read_recording("logs/tc016d.mcap")
+    >>> recording.topic, recording.truth.units, recording.notes
+    ('ground_truth', ('truth',), ())
     """
 
     scene: Scene

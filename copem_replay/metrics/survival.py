@@ -44,7 +44,7 @@ def cumulative_incidence(
     """Estimate the cumulative incidence of detection, departure competing: a right-continuous step function.
 
     `time_s (n,)`: seconds from the onset to the detection, or to when looking ended; finite, may be negative.
-    `ending (n,)`: `DETECTED`, `LEFT` or `CENSORED`. Of equal times, detections and departures come before
+    `ending (n,)`: `DETECTED` (1), `LEFT` (2) or `CENSORED` (0). Of equal times, detections and departures come before
     censorings: who is censored at t was looked at until t, t included.
     `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: what
     share of all weight is still somebody, to whom the weight of the censored goes.
@@ -57,6 +57,10 @@ def cumulative_incidence(
 
     Source: O. O. Aalen, S. Johansen, "An empirical transition matrix for non-homogeneous Markov chains based
     on censored observations", Scand. J. Statist. 5 (1978) 141–150; one state, left for one of two others.
+
+    >>> times_s, incidence = cr.cumulative_incidence(np.array([0.5, 0.5, 1.0, 2.0]), np.array([1, 1, 2, 1]))
+    >>> times_s, incidence
+    (array([0.5, 2. ]), array([0.5 , 0.75]))
     """
     _rows(time_s, ending)
     weight = _weights(time_s, weight)

@@ -68,6 +68,10 @@ class Provenance:
 class Results:
     """A results folder. Its files are read when they are first asked for, which raises InputError where one is damaged
     or is by now that of other results.
+
+    >>> results = cr.load_results("out/tc016d")
+    >>> results.name, results.experiment.runs, results.sweep is None
+    ('tc016d', 500, True)
     """
 
     folder: Path
@@ -123,6 +127,28 @@ class Results:
         """`sweep.csv`; None: there is no such file."""
         columns = ("sweep", "value", "configuration", "list_rate_hz")
         return self._frame("sweep.csv", columns) if (self.folder / "sweep.csv").is_file() else None
+
+    @property
+    def detections(self) -> pd.DataFrame:
+        """A row per log, configuration, run and measured object."""
+        return self.table
+
+    @cached_property
+    def accuracy(self) -> pd.DataFrame | None:
+        """Position errors and parts of GOSPA, list by list, in the order of `detections`; None: not measured."""
+        return self._frame("accuracy.parquet", ()) if (self.folder / "accuracy.parquet").is_file() else None
+
+    @cached_property
+    def bands(self) -> pd.DataFrame | None:
+        """Accuracy by configuration and by distance, time or existence; None: not measured."""
+        columns = ("configuration", "by", "from", "to")
+        return self._frame("bands.csv", columns) if (self.folder / "bands.csv").is_file() else None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What had to be said of the recordings and of the runs: one line each."""
+        notes = self.provenance.data.get("notes", [])
+        return tuple(map(str, notes)) if isinstance(notes, list) else ()
 
     @cached_property
     def arrow(self) -> dict[str, pa.Table]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import copem_replay
 from tests.helpers.experiments import TEXT, drive
 from tests.system.test_cli import Call, call, raising
 

@@ -39,7 +39,11 @@ _TOLERANCE = 1e-9  # absolute or relative: in another order sums are rounded oth
 
 
 class NonconformingError(AssertionError):
-    """A component breaks one of the RULES, `rule`: what was expected, what was found, in which scene and when."""
+    """A component breaks one of the RULES, `rule`: what was expected, what was found, in which scene and when.
+
+    >>> cr.NonconformingError("again", "mine", "Scene 'crowd'", "x_m differs").rule
+    'again'
+    """
 
     def __init__(self, rule: str, kind: str, where: str, said: str) -> None:
         self.rule = rule
@@ -50,6 +54,13 @@ def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool 
     """Raise NonconformingError for the first rule found broken; say nothing where a fusion keeps all RULES.
 
     `seed`: of the scenes, and of the orders tried. `units_in_any_order`: whether the order of units must not matter.
+
+    >>> class Silent(cr.StepFusion):
+    ...     def step(self, now_s, inbox, memory):
+    ...         return cr.entries_of(0), memory
+    >>> cr.check_fusion(Silent(kind="my_package.fusions:Silent"))
+    Traceback (most recent call last):
+    copem_replay.fusion.testing.check.NonconformingError: my_package.fusions:Silent breaks the rule 'silence': ...
     """
     trials = [_Trial(fusion, scene) for scene in small_scenes(seed)]
     firsts = [trial.answer(trial.scene) for trial in trials]

@@ -22,7 +22,14 @@ UNRESOLVED = 1e-15
 
 
 class Reaction(Component, ABC):
-    """Base of reaction models: seconds from the instant a list is available until the ego begins to brake."""
+    """Base of reaction models: seconds from the instant a list is available until the ego begins to brake.
+
+    >>> class Uniform(cr.Reaction):
+    ...     def delays(self, uniform):
+    ...         return 0.2 + 0.6 * uniform
+    >>> Uniform(kind="my_package.drivers:Uniform").delays(np.array([0.5]))
+    array([0.5])
+    """
 
     @abstractmethod
     def delays(self, uniform: Float) -> Float:
@@ -107,7 +114,14 @@ REACTIONS = {
 
 
 class Driver(Component, ABC):
-    """Base of driver models: how long it takes to react, and how hard it then brakes."""
+    """Base of driver models: how long it takes to react, and how hard it then brakes.
+
+    >>> class Gentle(cr.Driver):
+    ...     def deceleration_mps2(self, elapsed_s, speed_mps):
+    ...         return np.minimum(2.0 * elapsed_s, 4.0)
+    >>> Gentle(kind="my_package.drivers:Gentle").deceleration_mps2(np.array([[1.0, 3.0]]), np.array([[10.0]]))
+    array([[2., 4.]])
+    """
 
     reaction: Annotated[Reaction, Slot("reaction", REACTIONS)] = ConstantReaction()
 

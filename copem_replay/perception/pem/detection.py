@@ -15,7 +15,15 @@ from copem_replay.core.view_geometry import Look
 
 
 class DetectionModel(Component, ABC):
-    """Base of detection models."""
+    """Base of detection models.
+
+    >>> class Fading(cr.DetectionModel):
+    ...     def probability(self, look):
+    ...         return look.visible_share * np.exp2(-look.range_m / 50.0)
+    >>> view = cr.ViewGeometry(*np.full((10, 1), 1.0))
+    >>> Fading(kind="my_package.models:Fading").probability(view).round(3)
+    array([0.986])
+    """
 
     @abstractmethod
     def probability(self, look: Look) -> Float:

@@ -14,7 +14,17 @@ from copem_replay.core.view_geometry import Errors, Look, Noise
 
 
 class ErrorModel(Component, ABC):
-    """Base of error models."""
+    """Base of error models.
+
+    >>> class Widening(cr.ErrorModel):
+    ...     def perturb(self, look, noise):
+    ...         sigma_m = 0.01 * look.range_m
+    ...         east_m, north_m = sigma_m * noise("east"), sigma_m * noise("north")
+    ...         return cr.Errors(east_m, north_m, sigma_m**2, 0 * sigma_m, sigma_m**2)
+    >>> view = cr.ViewGeometry(*np.full((10, 1), 20.0))
+    >>> Widening(kind="my_package.models:Widening").perturb(view, lambda name: np.ones((4, 1))).cov_ee_m2.round(3)
+    array([0.04])
+    """
 
     @abstractmethod
     def perturb(self, look: Look, noise: Noise) -> Errors:

@@ -68,6 +68,10 @@ class Comparison:
 
     Columns of `table` as in COLUMNS, missing where there is none; times are up to `horizon_s`, those at equal ghosts at
     `ghosts_per_min`. `notes`: what has to be said, a line each.
+
+    >>> comparison = cr.compare("out/tc016d", baseline="PEM")
+    >>> comparison.baseline, comparison.configurations
+    ('PEM', ('GT', 'coPEM:0s', 'coPEM:0.5s', 'coPEM:1s', 'coPEM:1.5s'))
     """
 
     table: pd.DataFrame

@@ -1,0 +1,124 @@
+"""Results folders: read back, compared, reported and viewed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.results.compare import Comparison
+from copem_replay.results.read import Results
+
+if TYPE_CHECKING:  # of types alone
+    from copem_replay.cli.api.run import StudyResult
+
+AnyResults: TypeAlias = "Results | StudyResult | str | PathLike[str]"
+"""Results that are read back, a result that is saved, or the path of a results folder."""
+
+
+def load_results(folder: str | PathLike[str]) -> Results:
+    """Read a results folder: its experiment and its tables, under the names that `run` gives them.
+
+    `detections`, `summary`, and where the folder has them `exact`, `sweep`, `accuracy` and `bands` (else None): pandas,
+    times in seconds (`_s`), distances in metres (`_m`).
+
+    Raises InputError: no such folder, no results in it, or damaged ones.
+
+    >>> results = cr.load_results("out/tc016d")
+    >>> results.detections["configuration"].nunique(), len(results.summary)
+    (6, 6)
+    """
+    from copem_replay.results.read import load_results as load
+
+    return load(Path(folder))
+
+
+def compare(
+    results: AnyResults | Sequence[AnyResults],
+    *,
+    configurations: Sequence[str] | None = None,
+    baseline: str | None = None,
+    ghosts_per_min: float | None = None,
+) -> Comparison:
+    """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
+
+    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `ghosts_per_min`: false positives
+    per minute at which times to detection are compared once more; None: those of the baseline. `table` of the result
+    has a row per log, configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
+
+    Raises InputError with every reason why the results are unreadable or not comparable.
+
+    >>> comparison = cr.compare("out/tc016d", baseline="PEM")
+    >>> table = comparison.overall.set_index(["metric", "configuration"])
+    >>> table.loc[("ttd_rmst_s", "coPEM:0.5s"), "baseline_value"].round(1)
+    np.float64(0.8)
+    """
+    from copem_replay.results.compare import compare as compared
+
+    several = list(results) if isinstance(results, Sequence) and not isinstance(results, str) else [results]
+    return compared(
+        [folder_of(one) for one in several],
+        configurations=configurations,
+        baseline=baseline,
+        ghosts_per_min=ghosts_per_min,
+    )
+
+
+def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *, baseline: str | None = None) -> Path:
+    """Write the report of a results folder as one HTML file that opens offline. Returns its path.
+
+    `file`: None: `report.html` in the folder. `baseline`: None: the configuration named `ideal`, if any.
+
+    Raises InputError where the results are unreadable, OutputError where the file is not writable.
+
+    >>> cr.write_report("out/tc016d", "report.html").name
+    'report.html'
+    """
+    from copem_replay.report import write_report as write
+
+    return write(folder_of(results), None if file is None else Path(file), baseline=baseline)
+
+
+def view(results: AnyResults) -> None:
+    """Open the recordings of a results folder in the Rerun viewer, and wait until it ends.
+
+    Raises InputError: no such folder, or no `replay.rrd` in it; OutputError where the viewer does not open.
+
+    >>> cr.view("out/nowhere")
+    Traceback (most recent call last):
+    copem_replay.core.errors.InputError: out/nowhere: no such folder
+    """
+    import subprocess
+
+    folder = folder_of(results)
+    place = folder.absolute()  # no name that looks like an option
+    patterns = ("replay.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
+    files = [path for pattern in patterns for path in sorted(place.glob(pattern)) if path.is_file()]
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    if not files:
+        raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
+    # The module, not the script: it is there in every environment that has rerun-sdk, whatever the PATH.
+    code = subprocess.call([sys.executable, "-m", "rerun", *map(str, files)])
+    if code:
+        raise OutputError(
+            f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, copy "
+            f"{files[0].name} to a desktop and open it there: rerun {files[0].name}"
+        )
+
+
+def folder_of(results: AnyResults) -> Path:
+    """The folder of some results. Raises InputError where they are not saved."""
+    if isinstance(results, str | PathLike):
+        return Path(results)
+    if results.folder is None:
+        raise InputError("expected results in a folder, found some that are not saved; result.save(folder) does")
+    return results.folder
+
+
+def results_of(results: AnyResults) -> Results:
+    """Results as they are read back from their folder."""
+    return results if isinstance(results, Results) else load_results(folder_of(results))

@@ -1,0 +1,216 @@
+"""Runs: an experiment replayed, its tables, and what a receiver had in one run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from copem_replay.cli.api.study import AnyExperiment, AnyPath, AnyRecordings, Study, prepared, study_of
+from copem_replay.core.errors import InputError
+from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.tracks import CLASSES
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.run import Progress, Result
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from copem_replay.pipeline.log_replay import Replay
+    from copem_replay.results.place import Place
+
+
+@dataclass
+class StudyResult:
+    """What an experiment gave: pandas tables, as a results folder has them.
+
+    `detections`: a row per log, configuration, run and measured object. `summary`: a row per configuration.
+    `exact`, `sweep`, `accuracy`, `bands`: None where the experiment does not ask for them. Times are in seconds (`_s`),
+    distances in metres (`_m`); missing values are null. Source of each column: docs/measures.md.
+
+    >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
+    >>> result.detections.shape[0], result.exact is None
+    (7, True)
+    """
+
+    experiment: Experiment
+    recordings: tuple[Recording, ...]
+    replayed: Result
+    folder: Path | None = None
+    """The results folder, once they are saved."""
+
+    @property
+    def detections(self) -> pd.DataFrame:
+        """When, and how far away, each measured object was detected: log × configuration × run × object."""
+        return self.replayed.table
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """The metrics of each configuration."""
+        return self.replayed.summary
+
+    @property
+    def exact(self) -> pd.DataFrame | None:
+        """The probability of each time of detection, with `measure: {exact: true}`."""
+        return self.replayed.exact
+
+    @property
+    def sweep(self) -> pd.DataFrame | None:
+        """The summary at each value of the sweep, with `sweep:`."""
+        return self.replayed.sweep
+
+    @property
+    def accuracy(self) -> pd.DataFrame | None:
+        """Position errors and parts of GOSPA, list by list, in the order of `detections`."""
+        return None if self.replayed.accuracy is None else _frame(self.replayed.accuracy.accuracy)
+
+    @property
+    def bands(self) -> pd.DataFrame | None:
+        """Accuracy by configuration and by distance, time or existence."""
+        return None if self.replayed.accuracy is None else self.replayed.accuracy.bands
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What recordings lack, what was corrected, and what can hardly be meant: one line each."""
+        return self.replayed.notes
+
+    def save(self, folder: AnyPath, overwrite: bool = False) -> Path:
+        """Write the results folder, complete or not at all. Returns its path.
+
+        Raises OutputError: the folder holds something already (`overwrite` replaces results), or is not writable.
+
+        >>> result.save("out/example", overwrite=True).name
+        'example'
+        """
+        from copem_replay.results.place import check_inputs, taken
+
+        with taken(Path(folder), overwrite=overwrite) as place:
+            check_inputs(place, [recording.path for recording in self.recordings])
+            self.fill(place)
+        return place.shown
+
+    def fill(self, place: Place, *, skipped: Sequence[tuple[Path, str]] = (), viewer: str | None = None) -> list[str]:
+        """Write the results into a place that is taken. Returns what has to be said of them.
+
+        `skipped`: logs that are left out. `viewer`: where a Rerun viewer listens that gets what is written to .rrd.
+        """
+        from copem_replay.results.export import MCAP
+        from copem_replay.results.write import fill_place
+        from copem_replay.viewer.export import rrd_to
+
+        exporters = [MCAP, rrd_to(viewer)]
+        notes = fill_place(place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped)
+        self.folder = place.shown
+        return notes
+
+
+def _frame(table: pa.Table | None) -> pd.DataFrame | None:
+    return None if table is None else table.to_pandas()
+
+
+def run(
+    experiment: AnyExperiment,
+    recordings: AnyRecordings | None = None,
+    jobs: int | None = None,
+    progress: Progress | None = None,
+) -> StudyResult:
+    """Replay recordings through an experiment, and measure.
+
+    `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
+    paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
+    depend on it. `progress(done, total)` is called after each block of runs.
+
+    Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
+    both together, times without a closed form, runs that no memory holds.
+
+    >>> result = cr.run("logs/tc016d.yaml")
+    >>> result.summary["ttd_median_s"].round(3).tolist()
+    [0.0, 0.8, 0.0, 0.5, 1.0, 1.5]
+    """
+    study = study_of(experiment, recordings)
+    return replayed(study, prepared(study)[0], jobs, progress)
+
+
+def replayed(study: Study, ready: Sequence[Replay], jobs: int | None, progress: Progress | None) -> StudyResult:
+    """Replay a study whose logs are prepared."""
+    from copem_replay.pipeline.run import run as replay
+
+    result = replay(study.experiment, study.recordings, jobs=workers(jobs), progress=progress, ready=ready)
+    return StudyResult(study.experiment, study.recordings, result)
+
+
+def workers(jobs: int | None) -> int:
+    """How many workers there are: as many as are asked for, else one per core that this process may use."""
+    if jobs is not None:
+        if jobs < 1:
+            raise InputError(f"jobs: expected at least 1, found {jobs}")
+        return jobs
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run: int = 0) -> dict[str, Belief]:
+    """The fused lists of each configuration in one run of one recording: the same lists that `run` measures.
+
+    By the name of the configuration. `fused` holds the tracks, values (1, P) in metres, radians and m/s, and
+    `to_dataframe()` gives a row per entry.
+
+    Raises InputError as `run` does; ExperimentError where the recording is too long to be held at once.
+
+    >>> fused = cr.fused_tracks("logs/tc016d.yaml", "logs/tc016d.mcap", run=3)["coPEM:1s"]
+    >>> fused.to_dataframe()[["available_s", "object_id", "x_m"]].head(1)
+       available_s object_id       x_m
+    0          1.0         2  0.221615
+    """
+    from copem_replay.pipeline.selected_runs import one_run
+
+    study = study_of(experiment, recording)
+    if not 0 <= run < study.experiment.runs:
+        raise InputError(f"run: expected 0 … {study.experiment.runs - 1}, found {run}")
+    one = one_run(study.recordings[0], study.experiment, run)
+    return {name: replace(each, scene=one.replay.scene) for name, each in one.beliefs.whole().items()}
+
+
+def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> pd.DataFrame:
+    """How each unit sees each measured object at each capture: what its detection model goes by. Nothing is drawn.
+
+    A row per unit, object and capture: `captured_s`, `since_onset_s`, `range_m` (horizontal, to the centre of the box),
+    `azimuth_rad` (from the heading of the unit), `bearing_rad` (from east), `visible_share` and `probability` (0 … 1).
+
+    Raises InputError as `run` does.
+
+    >>> seen = cr.observations("logs/tc016d.yaml", "logs/tc016d.mcap").query("unit == 'ego'")
+    >>> seen.loc[seen["since_onset_s"].between(0.55, 0.75), "visible_share"].round(2).tolist()
+    [0.18, 0.37]
+    """
+    from copem_replay.pipeline.log_replay import prepare
+
+    study = study_of(experiment, recording)
+    replay = prepare(study.recordings[0], study.experiment)
+    found, looks = replay.measured, replay.looks
+    tracks, scene = found.tracks, replay.scene
+    onset_s = pd.Series(looks.onset_s, index=looks.object_ix).reindex(tracks.row_object_ix).to_numpy()
+    return pd.DataFrame(
+        {
+            "unit": _named(tracks.units, tracks.row_unit_ix),
+            "object_id": _named(scene.object_ids, tracks.row_object_ix),
+            "object_class": _named(CLASSES, scene.object_class[tracks.row_object_ix]),
+            "captured_s": tracks.row_captured_s,
+            "since_onset_s": tracks.row_captured_s - onset_s,
+            "range_m": found.look.range_m,
+            "azimuth_rad": found.look.azimuth_rad,
+            "bearing_rad": found.look.bearing_rad,
+            "visible_share": found.look.visible_share,
+            "probability": found.probability,
+        }
+    )
+
+
+def _named(names: Sequence[str], numbers: NDArray[np.integer[Any]]) -> list[str]:
+    return [names[k] for k in numbers]

@@ -1,0 +1,160 @@
+"""An experiment and its recordings, checked together: what every function and every command begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.experiment.cross_references import NO_EGO, references
+from copem_replay.experiment.file import Source, load, log_paths, plain
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import across_logs, against_log, log_names, problems, read_logs
+from copem_replay.io.recording import Recording
+
+if TYPE_CHECKING:  # it imports what a look at an experiment does not need
+    from copem_replay.pipeline.log_replay import Replay
+
+AnyPath: TypeAlias = str | PathLike[str]
+AnyExperiment: TypeAlias = Experiment | Mapping[str, Any] | AnyPath
+"""An experiment, its keys and values, or the path of its file."""
+AnyRecordings: TypeAlias = Recording | AnyPath | Sequence[Recording] | Sequence[AnyPath]
+"""Recordings, or their paths; one or several."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """An experiment and the recordings it replays. `skipped`: logs that are left out, each with the reason."""
+
+    source: Source
+    experiment: Experiment
+    recordings: tuple[Recording, ...]
+    skipped: tuple[tuple[Path, str], ...] = ()
+
+
+def load_experiment(experiment: AnyExperiment) -> Experiment:
+    """Load an experiment from a YAML file, or from the same keys and values in a dict, and check it.
+
+    `logs` then holds the paths of the recordings, globs resolved, relative to the working folder. Of a dict they are
+    optional. Units are those of the file: `_m`, `_s`, `_deg` as the names of the keys say.
+
+    Raises ExperimentError with all problems at once (`problems`: a line each, with file, line and key): an unreadable
+    file, unknown keys, wrong values, undefined units or PEMs, `logs` that match no file.
+
+    >>> experiment = cr.load_experiment("logs/tc016d.yaml")
+    >>> experiment.runs, experiment.logs
+    (500, ('logs/tc016d.mcap',))
+    """
+    source, given = source_of(experiment)
+    checked, found = _examined(source, given)
+    if checked is None or found:
+        raise ExperimentError(found)
+    return checked.model_copy(update={"logs": tuple(map(str, log_paths(source)[0]))})
+
+
+def source_of(experiment: AnyExperiment) -> tuple[Source, Experiment | None]:
+    """Plain data of an experiment; the experiment itself where it is given: no name need lead to its own classes."""
+    if isinstance(experiment, Experiment):
+        return plain(experiment.as_written()), experiment
+    if isinstance(experiment, Mapping):
+        return plain(experiment), None
+    return load(Path(experiment)), None
+
+
+def _examined(source: Source, given: Experiment | None) -> tuple[Experiment | None, list[str]]:
+    """The experiment, None where its shape is wrong, and all problems that show without a look at the logs."""
+    if given is None:
+        return problems(source)
+    return given, [*references(source), *log_paths(source)[1]]
+
+
+def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None) -> Study:
+    """An experiment with its recordings: those it names (None), those at some paths, or those that are read already.
+
+    Raises InputError with all problems of the experiment and of the recordings.
+    """
+    source, given = source_of(experiment)
+    if recordings is None:
+        return read_study(source, given)
+    listed = [recordings] if isinstance(recordings, Recording | str | PathLike) else list(recordings)
+    paths = tuple(str(Path(one.path if isinstance(one, Recording) else one)) for one in listed)
+    if not paths:
+        raise InputError("recordings: expected at least one, found none")
+    options = {**source.options, ("logs",): "recordings"}
+    source = replace(source, data=source.data | {"logs": list(paths)}, logs=paths, options=options)
+    read = [one for one in listed if isinstance(one, Recording)]
+    if not read:
+        return read_study(source, given)
+    if len(read) < len(listed):
+        raise InputError("recordings: expected either recordings or paths, found both")
+    return _study_with(source, given, read)
+
+
+def read_study(source: Source, given: Experiment | None = None, *, skip_unreadable: bool = False) -> Study:
+    """Read the recordings of an experiment. Raises InputError with every problem of it and of them."""
+    experiment, found = _examined(source, given)
+    if experiment is None:
+        raise ExperimentError(found)
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source)
+    if not recordings and not refused and not found:
+        found.append(source.at(("logs",), "expected at least one recording, found none"))
+    if not skip_unreadable or not recordings:
+        found += [log.said(source) for log in refused]
+    found += across_logs(experiment, recordings, source)
+    if found:
+        raise InputError(found)
+    return Study(source, experiment, tuple(recordings), tuple((log.path, log.reason) for log in refused))
+
+
+def _study_with(source: Source, given: Experiment | None, recordings: Sequence[Recording]) -> Study:
+    """An experiment with recordings that are read already, checked against it."""
+    experiment, found = _examined(source, given)
+    if experiment is None:
+        raise ExperimentError(found)
+    for recording in recordings:
+        found += _misread(experiment, recording)
+        found += [source.at(key, f"{recording.path}: {reason}") for key, reason in against_log(experiment, recording)]
+    found += across_logs(experiment, recordings, source)
+    names = [recording.scene.log for recording in recordings]
+    if len(set(names)) < len(names):
+        names = log_names([recording.path for recording in recordings])
+        found += [f"recordings: expected each once, found {n} twice" for n in {*names} if names.count(n) > 1]
+    if found:
+        raise InputError(found)
+    named = (replace(r, scene=replace(r.scene, log=name)) for r, name in zip(recordings, names, strict=True))
+    return Study(source, experiment, tuple(named))
+
+
+def _misread(experiment: Experiment, recording: Recording) -> Iterator[str]:
+    """How a recording was read otherwise than the experiment says."""
+    way_out = "read it with read_recordings(experiment)"
+    scene, asked = recording.scene, experiment.ego
+    found = scene.object_ids[scene.ego_ix] if scene.ego_ix >= 0 else NO_EGO
+    if isinstance(asked, str) and asked != found:
+        yield f"{recording.path}: ego: expected {asked} as in the experiment, found {found}; {way_out}"
+    for name in experiment.recorded.keys() - recording.lists.keys():
+        yield f"{recording.path}: expected the recorded lists of the unit {name}, found none; {way_out}"
+
+
+def prepared(study: Study) -> tuple[list[Replay], list[str]]:
+    """The logs made ready to be replayed, and what has to be said before any run.
+
+    Raises ExperimentError for what cannot be done with them: times without a closed form, runs that no memory holds.
+    """
+    from copem_replay.pipeline.log_replay import prepare
+    from copem_replay.pipeline.memory import memory_notes
+
+    ready = [prepare(recording, study.experiment) for recording in study.recordings]
+    key: tuple[str, ...] = ("measure", "exact")
+    try:
+        if study.experiment.measure.exact:
+            from copem_replay.pipeline.run import check_closed_form
+
+            check_closed_form(ready, study.experiment)
+        key = ("runs",)
+        return ready, memory_notes(ready, study.experiment)
+    except ExperimentError as error:
+        raise ExperimentError([study.source.at(key, problem) for problem in error.problems]) from None

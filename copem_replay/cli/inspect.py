@@ -1,0 +1,111 @@
+"""Commands that look at recordings and experiments: info, init, check, schema."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from copem_replay.cli.options import Ego, ExperimentFile, FromS, LogFile, LogFiles, Logs, ToS
+from copem_replay.cli.terminal import complain, note, say, say_blocks
+from copem_replay.core.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from copem_replay.core.yaml import Key
+    from copem_replay.experiment.file import Source
+
+
+def info(
+    logs: LogFiles,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: one array, an entry per recording.")] = False,
+) -> int:
+    """Describe recordings: topics, object lists, objects, span, rate, ego vehicle, what is missing.
+
+    The exit code is 0 when at least one object list is readable, else 2.
+    """
+    from copem_replay.cli.api.recordings import inspect_recording
+    from copem_replay.experiment.draft.survey import describe
+
+    surveys = [inspect_recording(log) for log in logs]
+    if as_json:
+        print(json.dumps(surveys, indent=1, ensure_ascii=False))
+    else:
+        say_blocks(describe(s) for s in surveys if s["topics"])
+    complain(s["reason"] for s in surveys if not s["readable"])
+    return 0 if any(s["readable"] for s in surveys) else 2
+
+
+def init(log: LogFile) -> int:
+    """Print an experiment that replays a recording, with comments: copem-replay init LOG > experiment.yaml.
+
+    Its paths are relative to the working folder. For lists of an unknown schema, `read:` is proposed from the names of
+    their fields. The exit code is 2 when no list of true objects is readable.
+    """
+    from copem_replay.cli.api.recordings import draft_of, encodable
+    from copem_replay.experiment.draft.template import unfinished
+
+    text, found = draft_of(log)
+    if text is None:
+        print(unfinished(found), end="")
+        raise InputError(found["reason"])
+    encodable(log)
+    print(text, end="")
+    return 0
+
+
+def check(
+    experiment: ExperimentFile,
+    log: Logs = None,
+    ego: Ego = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
+) -> int:
+    """Report every problem of an experiment file at once, with file and line, against its recordings too."""
+    from copem_replay.cli.api.study import prepared, read_study
+    from copem_replay.pipeline.oddities import notes_of
+
+    study = read_study(source_with(experiment, {"ego": ego}, log or (), (from_s, to_s)))
+    ready, warnings = prepared(study)
+    note([*notes_of(study.recordings, ready, study.experiment, replayed=False), *warnings])
+    say(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
+    return 0
+
+
+def schema() -> int:
+    """Print the JSON Schema of the experiment file, with all installed components."""
+    from copem_replay.experiment.schema import Experiment
+
+    described = Experiment.model_json_schema(by_alias=True) | {
+        "$schema": "https://json-schema.org/draft/2020-12/schema"
+    }
+    print(json.dumps(described, indent=1))
+    return 0
+
+
+def source_with(
+    path: Path,
+    changes: Mapping[str, object],
+    logs: Sequence[Path],
+    window_s: tuple[float | None, float | None],
+) -> Source:
+    """The experiment file, with the options that are given in the place of its keys."""
+    from dataclasses import replace
+
+    from copem_replay.experiment.file import load
+
+    source = load(path)
+    given = {name: value for name, value in changes.items() if value is not None}
+    options: dict[Key, str] = {(name,): f"--{name}" for name in given}
+    ends = {k: option for k, option in enumerate(("--from", "--to")) if window_s[k] is not None}
+    if ends:
+        written = source.data.get("window_s")
+        window = written if isinstance(written, list) and len(written) == len(window_s) else [None, None]
+        given["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
+        options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
+    if logs:
+        given["logs"] = [str(log) for log in logs]
+    return replace(source, data=source.data | given, options=options, logs=tuple(map(str, logs)))

@@ -1,0 +1,110 @@
+"""Commands on results folders: compare, plot, report, view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from copem_replay.cli.options import Baseline, ResultsFolder, listed
+from copem_replay.cli.terminal import note, say, say_blocks, tidied
+from copem_replay.core.errors import InputError
+
+
+def compare(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Results folders.")],
+    configurations: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
+    ] = None,
+    baseline: Baseline = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write everything as .csv, or the table as .md.")
+    ] = None,
+    ghosts_per_min: Annotated[
+        float | None,
+        typer.Option(metavar="X", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
+    ] = None,
+    rrd: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write one run of all of them as a Rerun recording (.rrd).")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option(metavar="N", help="Run in that recording [as in the baseline's replay.rrd].")
+    ] = None,
+    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log in that recording [likewise].")] = None,
+) -> int:
+    """Compare configurations with a baseline, paired by log, object and run, within or across results folders."""
+    from copem_replay.cli.api.results import compare as compared
+    from copem_replay.results.compare import check_out, comparison_text, write_comparison
+
+    if out is not None:
+        check_out(out)
+    if rrd is not None:
+        from copem_replay.viewer.side_by_side import check_beside, write_beside
+
+        check_beside(rrd)
+    elif run is not None or log is not None:
+        raise InputError(f"--{'log' if run is None else 'run'}: expected --rrd FILE with it, found none")
+    names = listed(configurations)
+    comparison = compared(folders, configurations=names, baseline=baseline, ghosts_per_min=ghosts_per_min)
+    notes = list(comparison.notes)
+    if rrd is not None:
+        notes += write_beside(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
+    note(notes)
+    say_blocks([comparison_text(comparison).splitlines()])
+    if out is not None:
+        write_comparison(comparison, out)
+    for file in (out, rrd):
+        if file is not None:
+            tidied(file)
+            say(f"written to {file}")
+    return 0
+
+
+def plot(
+    folder: ResultsFolder,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [DIR/figures].")] = None,
+    configurations: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Only these [all; of single runs four of them].")
+    ] = None,
+    run: Annotated[int | None, typer.Option(metavar="N", help="Run in the figure [as in replay.rrd].")] = None,
+    object: Annotated[
+        str | None, typer.Option(metavar="ID", help="Object in the figure of single runs [the first in conflict].")
+    ] = None,
+    log: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Log in the figure of single runs [the first].")
+    ] = None,
+) -> int:
+    """Draw the figures of a results folder as PNG and SVG: single runs, distances, detection curves, sweeps."""
+    from copem_replay.cli.api.plot import write_figures
+
+    names = listed(configurations)
+    files, notes = write_figures(folder, out, configurations=names, log=log, object_id=object, run=run)
+    note(notes)
+    figures = out or folder / "figures"
+    tidied(figures, figures)
+    tidied(figures)
+    say_blocks([[str(file) for file in files]])
+    return 0
+
+
+def report(
+    folder: ResultsFolder,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [DIR/report.html].")] = None,
+    baseline: Baseline = None,
+) -> int:
+    """Write the report of a results folder as one HTML file that opens offline: words, tables, figures, provenance."""
+    from copem_replay.cli.api.results import write_report
+
+    path = write_report(folder, out, baseline=baseline)
+    tidied(path)
+    say(f"report in {path}")
+    return 0
+
+
+def view(folder: ResultsFolder) -> int:
+    """Open the recordings of a results folder in the Rerun viewer."""
+    from copem_replay.cli.api.results import view as opened
+
+    opened(folder)
+    return 0

@@ -1,0 +1,75 @@
+"""The command that replays: run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from copem_replay.cli.inspect import source_with
+from copem_replay.cli.options import Ego, ExperimentFile, FromS, Logs, ToS
+from copem_replay.cli.terminal import note, say, with_progress
+from copem_replay.core.errors import InputError
+
+if TYPE_CHECKING:
+    from copem_replay.experiment.schema import Experiment
+
+
+def run(
+    experiment: ExperimentFile,
+    log: Logs = None,
+    ego: Ego = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Results folder [out/<experiment>].")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Number of runs.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=1024, help="Number of workers [one per core].")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in the folder.")] = False,
+    skip_unreadable: Annotated[
+        bool, typer.Option("--skip-unreadable", help="Leave out recordings that cannot be replayed.")
+    ] = False,
+    report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
+    viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
+) -> int:
+    """Replay an experiment, measure, write the results folder, and print the summary."""
+    from copem_replay.cli.api.study import prepared, read_study
+    from copem_replay.results.place import check_inputs, taken
+
+    source = source_with(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
+    with taken(out or Path("out") / experiment.stem, overwrite=overwrite) as place:
+        note(place.notes)
+        place.notes.clear()
+        study = read_study(source, skip_unreadable=skip_unreadable)
+        check_inputs(place, [experiment, *(recording.path for recording in study.recordings)])
+        url = _viewer(study.experiment, viewer) if live or viewer is not None else None
+        from copem_replay.cli.api.run import replayed
+        from copem_replay.metrics.summary_text import summary_text
+
+        ready, warnings = prepared(study)
+        note(warnings)
+        result = with_progress(lambda progress: replayed(study, ready, jobs, progress))
+        notes = result.fill(place, skipped=study.skipped, viewer=url)
+        skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
+        note([*place.notes, *skipped, *notes, *result.replayed.costs])
+        print(summary_text(result.summary))
+        if result.sweep is not None:
+            say(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
+        say(f"results in {place.shown}")
+        if report:
+            from copem_replay.cli.api.results import write_report
+
+            say(f"report in {write_report(place.shown)}")
+    return 1 if study.skipped else 0
+
+
+def _viewer(experiment: Experiment, url: str | None) -> str:
+    """Where a viewer listens; refused before the replay where there is none, or nothing to show in it."""
+    from copem_replay.viewer import VIEWER, check_viewer
+
+    if experiment.show is None or experiment.show.run is None:
+        raise InputError("--live: nothing to show, the experiment says so (`show: null`, or its `run`)")
+    check_viewer(url or VIEWER)
+    return url or VIEWER

@@ -1,0 +1,260 @@
+"""The public API: every name is there, typed and lazy, and what it takes and gives is what its commands do."""
+
+from __future__ import annotations
+
+import ast
+import filecmp
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import copem_replay as cr
+from copem_replay.cli import main as cli
+from tests.helpers.experiments import TEXT, drive
+
+ROOT = Path(__file__).parents[2]
+INIT = ROOT / "copem_replay/__init__.py"
+SURE = {"sure": [{"detection": {"kind": "constant", "probability": 1}}]}
+HEAVY = {"numba", "pandas", "matplotlib", "numpy", "pydantic", "scipy", "pyarrow", "rerun", "plotly"}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with the small experiment, `e.yaml`, and its recording."""
+    monkeypatch.chdir(tmp_path)
+    drive(tmp_path / "drive.mcap")
+    (tmp_path / "e.yaml").write_text(TEXT)
+    (tmp_path / "shown.yaml").write_text(TEXT.replace("show: null", "show: {run: 2}"))
+    return tmp_path
+
+
+class TestNames:
+    def test_every_name_is_there_and_for_editors_too(self) -> None:
+        (block,) = (node for node in ast.parse(INIT.read_text()).body if isinstance(node, ast.If))
+        typed = {
+            alias.asname or alias.name: (node.module, alias.name)
+            for node in block.body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        assert set(typed) == set(cr.__all__)
+        for name, (module, own) in typed.items():
+            found = getattr(cr, name)
+            assert found is getattr(__import__(str(module), fromlist=[own]), own), name
+        assert set(cr.__all__) <= set(dir(cr))
+        assert not [name for name in dir(cr) if name not in cr.__all__ and not name.startswith("__")]
+
+    def test_another_name_is_refused(self) -> None:
+        with pytest.raises(AttributeError, match="'copem_replay' has no attribute 'rum'"):
+            cr.rum  # type: ignore[attr-defined]  # noqa: B018
+
+    @pytest.mark.parametrize("code", ["import copem_replay", "import copem_replay; dir(copem_replay)"])
+    def test_importing_it_imports_nothing_heavy(self, code: str) -> None:
+        code = f"import sys; {code}; sys.exit(str({HEAVY} & sys.modules.keys() or ''))"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.stderr.strip() == ""
+
+    def test_help_imports_nothing_heavy(self) -> None:
+        code = (
+            "import sys\nfrom copem_replay.cli import main as cli\nsys.argv = ['copem-replay', '--help']\n"
+            f"cli._ended()\nsys.exit(str({HEAVY} & sys.modules.keys() or ''))"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.stderr.strip() == ""
+        assert "Replay recorded traffic" in done.stdout
+
+
+class TestLoadExperiment:
+    def test_of_a_file_in_another_folder(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        (here / "below").mkdir()
+        monkeypatch.chdir(here / "below")
+        experiment = cr.load_experiment("../e.yaml")
+        assert experiment.logs == ("../drive.mcap",)
+        (recording,) = cr.read_recordings(experiment)
+        assert recording.scene.log == "drive"
+
+    def test_globs_are_resolved(self, here: Path) -> None:
+        drive(here / "drive2.mcap")
+        plan = {"version": 1, "logs": ["drive*.mcap"], "configurations": {"GT": {"units": "truth"}}}
+        assert cr.load_experiment(plan).logs == ("drive.mcap", "drive2.mcap")
+
+    def test_all_problems_at_once(self, here: Path) -> None:
+        (here / "bad.yaml").write_text(TEXT.replace("pem:", "pen:", 1) + "runz: 3\n")
+        with pytest.raises(cr.ExperimentError) as refused:
+            cr.load_experiment(here / "bad.yaml")
+        assert len(refused.value.problems) >= 2
+        assert all(line.startswith(f"{here}/bad.yaml:") for line in refused.value.problems)
+
+    def test_a_dict_has_no_lines(self) -> None:
+        plan = {"version": 1, "configurations": {"A": {"units": ["x"]}}, "runs": 0}
+        with pytest.raises(cr.ExperimentError) as refused:
+            cr.load_experiment(plan)
+        assert refused.value.problems == (
+            "experiment: runs: expected at least 1, found 0",
+            "experiment: configurations.A.units[0]: no unit is named 'x'; there are none",
+        )
+
+    def test_logs_are_optional_in_python_only(self, here: Path) -> None:
+        assert cr.Experiment(version=1, configurations={"GT": cr.Configuration(units="truth")}).logs == ()
+        text = "\n".join(line for line in TEXT.splitlines() if not line.startswith("logs:"))
+        (here / "none.yaml").write_text(text)
+        with pytest.raises(cr.ExperimentError, match=r"none.yaml:1: logs: missing"):
+            cr.load_experiment(here / "none.yaml")
+        assert cr.run(here / "none.yaml", here / "drive.mcap").detections["log"].unique().tolist() == ["drive"]
+
+
+class TestRun:
+    def test_same_folder_as_the_command(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sys, "argv", ["copem-replay", "run", "e.yaml"])
+        assert cli._ended() == 0
+        done: list[tuple[int, int]] = []
+        result = cr.run("e.yaml", jobs=2, progress=lambda *at: done.append(at))
+        assert done[-1][0] == done[-1][1] > 0
+        assert result.save("out/api") == Path("out/api")
+        names = sorted(path.name for path in (here / "out/api").iterdir())
+        assert names == sorted(path.name for path in (here / "out/e").iterdir())
+        _, differ, errors = filecmp.cmpfiles("out/e", "out/api", [n for n in names if n != "replay.rrd"], shallow=False)
+        assert (differ, errors) == ([], [])
+
+    def test_read_back_under_the_same_names(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        result.save("out/e")
+        read = cr.load_results("out/e")
+        pd.testing.assert_frame_equal(read.detections, result.detections, check_dtype=False)
+        assert read.summary["configuration"].tolist() == result.summary["configuration"].tolist()
+        assert read.notes == result.notes
+        assert (read.exact is None, read.sweep is None) == (result.exact is None, result.sweep is None)
+        for name in ("accuracy", "bands"):
+            kept, given = getattr(read, name), getattr(result, name)
+            assert (kept is None) == (given is None)
+            if kept is not None:
+                assert kept.shape == given.shape
+                assert list(kept.columns) == list(given.columns)
+        with pytest.raises(cr.OutputError, match="results are there already"):
+            result.save("out/e")
+        result.save("out/e", overwrite=True)
+
+    def test_whatever_form_experiment_and_recordings_have(self, here: Path) -> None:
+        expected = cr.run("e.yaml").detections
+        experiment = cr.load_experiment("e.yaml")
+        recordings = cr.read_recordings(experiment)
+        plan = experiment.as_written()
+        for given in [
+            (experiment,),
+            (plan,),
+            (experiment, recordings),
+            (experiment, recordings[0]),
+            (plan, "drive.mcap"),
+            (here / "e.yaml", [here / "drive.mcap"]),
+        ]:
+            pd.testing.assert_frame_equal(cr.run(*given).detections, expected)
+
+    def test_two_recordings_of_one_name_are_told_apart(self, here: Path) -> None:
+        (here / "a").mkdir()
+        drive(here / "a/drive.mcap")
+        plan = {"version": 1, "configurations": {"GT": {"units": "truth"}}}
+        read = [cr.read_recording(path) for path in ("drive.mcap", "a/drive.mcap")]
+        logs = cr.run(plan, read).detections["log"].unique().tolist()
+        assert logs == [f"{here.name}/drive", "a/drive"]
+        with pytest.raises(cr.InputError, match="expected each once"):
+            cr.run(plan, [read[0], read[0]])
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            ({"ego": "none", "measure": {"distance_to": "ego"}}, "ego: expected none as in the experiment, found "),
+            ({"units": {"u": {"recorded": {"topic": "t"}}}}, "expected the recorded lists of the unit u, found none"),
+            ({"units": {"u": {"on": "99", "pem": "sure"}}, "pems": SURE}, "no object '99' in the log"),
+        ],
+    )
+    def test_a_recording_that_does_not_fit_is_refused(self, here: Path, change: dict[str, Any], said: str) -> None:
+        plan = {"version": 1, "configurations": {"GT": {"units": "truth"}}} | change
+        with pytest.raises(cr.InputError, match=r"drive\.mcap: ") as refused:
+            cr.run(plan, cr.read_recording("drive.mcap"))
+        assert said in str(refused.value)
+
+    @pytest.mark.parametrize(
+        ("recordings", "said"),
+        [
+            ("nope.mcap", "nope.mcap: no such file"),
+            ("*.bag", "recordings: no file matches '*.bag'"),
+            ([], "recordings: expected at least one, found none"),
+            (None, "experiment: logs: expected at least one recording, found none"),
+        ],
+    )
+    def test_recordings_that_are_not_there(self, here: Path, recordings: Any, said: str) -> None:
+        with pytest.raises(cr.InputError) as refused:
+            cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, recordings)
+        assert refused.value.problems == (said,)
+
+    def test_jobs(self, here: Path) -> None:
+        with pytest.raises(cr.InputError, match="jobs: expected at least 1, found 0"):
+            cr.run("e.yaml", jobs=0)
+
+
+class TestFusedTracks:
+    def test_the_same_lists_as_in_the_written_run(self, here: Path) -> None:
+        cr.run("shown.yaml").save("out/e")
+        (recording,) = cr.read_recordings("e.yaml")
+        fused = cr.fused_tracks("e.yaml", recording, run=2)
+        for name, each in fused.items():
+            found = each.to_dataframe()
+            lists = cr.read_lists("out/e/replay.mcap", f"copem/{name}/objects", recording.scene)
+            order = lists.by_frame[0]
+            ids = np.array(recording.scene.object_ids)[lists.row_object_ix[order]]
+            assert len(found) > 0
+            arrives_s = lists.arrives_s[0, lists.frame_ix[order]]
+            written = zip(arrives_s.round(6), ids, lists.x_m[0, order].round(6), strict=True)
+            columns = (found["available_s"].round(6), found["object_id"], found["x_m"].round(6))
+            assert sorted(zip(*columns, strict=True)) == sorted(written)
+            assert (found["captured_s"] <= found["available_s"] + 1e-9).all()
+
+    def test_a_run_beyond_the_experiment(self, here: Path) -> None:
+        runs = cr.load_experiment("e.yaml").runs
+        with pytest.raises(cr.InputError, match=f"run: expected 0 … {runs - 1}, found {runs}"):
+            cr.fused_tracks("e.yaml", "drive.mcap", run=runs)
+
+
+class TestFolders:
+    def test_what_is_not_saved_has_no_folder(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        with pytest.raises(cr.InputError, match=r"result\.save\(folder\) does"):
+            cr.compare(result)
+
+    def test_a_result_a_reading_and_a_path_are_the_same(self, here: Path) -> None:
+        result = cr.run("e.yaml")
+        result.save("out/e")
+        baseline = result.summary["configuration"][0]
+        tables = [cr.compare(one, baseline=baseline).table for one in (result, cr.load_results("out/e"), "out/e")]
+        assert len(tables[0]) > 0
+        for table in tables[1:]:
+            pd.testing.assert_frame_equal(table, tables[0])
+        assert cr.write_report(result, "page.html") == Path("page.html")
+        assert cr.write_report(cr.load_results("out/e")) == Path("out/e/report.html")
+        assert (here / "page.html").stat().st_size > 0
+
+    def test_view_opens_the_recordings(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        cr.run("shown.yaml").save("out/e")
+        called: list[list[str]] = []
+        monkeypatch.setattr(subprocess, "call", lambda words: called.append(words) or 0)
+        cr.view(cr.load_results("out/e"))
+        assert called == [[sys.executable, "-m", "rerun", str(here / "out/e/replay.rrd")]]
+
+
+class TestRecordings:
+    def test_a_draft_runs(self, here: Path) -> None:
+        (here / "draft.yaml").write_text(cr.draft_experiment("drive.mcap"))
+        assert len(cr.run("draft.yaml").summary) > 0
+
+    def test_no_draft_of_what_is_unreadable(self, here: Path) -> None:
+        (here / "bad.mcap").write_bytes(b"no recording")
+        found = cr.inspect_recording("bad.mcap")
+        assert not found["readable"]
+        with pytest.raises(cr.RecordingError) as refused:
+            cr.draft_experiment("bad.mcap")
+        assert refused.value.problems == (found["reason"],)
