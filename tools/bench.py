@@ -27,7 +27,9 @@ from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import read
 from copem_replay.perception.visibility import NO_STATICS, Observers, visible_shares
-from copem_replay.pipeline.log_replay import believed, prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 
 ROOT = Path(__file__).parents[1]
 

@@ -115,7 +115,7 @@ def check(
     """Every problem of an experiment file at once, with file and line, against its logs too."""
     source = _source(experiment, {"ego": ego}, log or [], (from_s, to_s))
     wanted, recordings, _skipped = _ready(source, skip_unreadable=False)
-    from copem_replay.pipeline.oddities import notes_of
+    from copem_replay.pipeline.notes import notes_of
 
     prepared, warnings = _prepared(source, wanted, recordings)
     notes = notes_of(recordings, prepared, wanted, replayed=False) + warnings
@@ -368,8 +368,8 @@ def _tidied(path: Path, place: Path | None = None) -> None:
 def _prepared(source: Any, experiment: Any, recordings: Any) -> tuple[Any, list[str]]:
     """The logs made ready, and what is to be said before any run; raises with what cannot be done with them."""
     from copem_replay.core.errors import ExperimentError
-    from copem_replay.pipeline.log_replay import prepare
     from copem_replay.pipeline.memory import memory_notes
+    from copem_replay.pipeline.prepare import prepare
 
     prepared = [prepare(recording, experiment) for recording in recordings]
     key: tuple[str, ...] = ("measure", "exact")

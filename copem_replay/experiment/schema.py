@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
+from copem_replay.communication.link import ConstantLink, LinkModel
 from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
@@ -76,18 +77,28 @@ class Unit(Placement):
 
 
 class Configuration(Frozen):
-    """What is compared: which units, which fusion, which latency."""
+    """What is compared: which units, which fusion, which latency, by unit or not, or which `link` of the user's own."""
 
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
     latency_s: Latency | dict[Id, Latency] = 0.0
+    link: Annotated[LinkModel, Slot("link", {})] | None = Field(default=None, exclude_if=lambda link: link is None)
     max_age_s: Positive = 1.0
 
-    def latency_of(self, unit: str) -> float:
-        """Seconds from capture to arrival of a unit's lists."""
-        if isinstance(self.latency_s, dict):
-            return self.latency_s.get(unit, self.latency_s.get("default", 0.0))
-        return self.latency_s
+    @model_validator(mode="after")
+    def _one_link(self) -> Self:
+        if self.link is not None and self.latency_s:
+            raise ValueError("link: expected either `latency_s` or `link`, found both")
+        return self
+
+    @property
+    def link_model(self) -> LinkModel:
+        """The link to the receiver: the declared one, else that of `latency_s`."""
+        return ConstantLink(latency_s=self.latency_s) if self.link is None else self.link
+
+    def latency_of(self, unit: str) -> float | None:
+        """Seconds from capture to arrival of every list of a unit; None: they differ from list to list."""
+        return self.link_model.fixed_s(unit)
 
 
 def _how_many(value: object) -> object:

@@ -15,7 +15,7 @@ from copem_replay.perception.pem.condition import Condition, Couple
 from copem_replay.perception.sensor_poses import Poses, carrier, observers, poses, unit_ground
 from copem_replay.perception.visibility import hidden_by, visible_shares
 from copem_replay.pipeline.chunking import ROWS_A_STRETCH
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import f32
 
 CLEAR_ABOVE = 0.5

@@ -10,7 +10,7 @@ import pandas as pd
 
 from copem_replay.core.tracks import Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import Out, ns, part_of, short_ids
 
 _ENDINGS = {
