@@ -18,6 +18,7 @@ from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
 from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.visibility import Surface, Visibility
 
 
 def _unit_name(value: str) -> str:
@@ -233,7 +234,7 @@ class Experiment(Frozen):
     pems: dict[Id, Pem] = Field(default_factory=dict)
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()
-    visibility: Literal["surface", "flat"] = "surface"
+    visibility: Visibility = Field(default=Surface(), json_schema_extra={"default": "surface"})
     configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]
     measure: Measure = Measure()
     braking: Braking | None = None

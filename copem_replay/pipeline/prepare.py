@@ -123,8 +123,11 @@ class Replay:
         units = fleet_of(experiment, self.scene).experiment
         return World(self.scene, self.truth, self._whole.listable, self.recorded, units)
 
-    def worlds(self, experiment: Experiment, sending: Bool, *, measured_only: bool = False) -> Iterator[World]:
-        """The same stretch by stretch, all of it or what is looked at, for receivers of the units `sending (U,)`."""
+    def worlds(self, experiment: Experiment, sending: Bool | None, *, measured_only: bool = False) -> Iterator[World]:
+        """The same stretch by stretch, all of it or what is looked at.
+
+        `sending (U,)`: the units whose lists the receivers hear, None: all.
+        """
         if self.stretches == (WHOLE,):
             whole = self.world(experiment)
             yield replace(whole, found=self.measured.listable) if measured_only else whole

@@ -195,7 +195,7 @@ def _properties(
         run=run,
         run_is=run_is,
         seed=experiment.seed,
-        visibility=experiment.visibility,
+        visibility=experiment.visibility.label,
         configurations=configurations,
         copem_replay=version("copem-replay"),
         rerun_sdk=version("rerun-sdk"),

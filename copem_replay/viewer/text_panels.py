@@ -154,7 +154,7 @@ def summary(
     """Which run this is, and the table over all runs and logs, configurations side by side."""
     import rerun as rr
 
-    what = f"Run {run} of {replay.scene.log}, seed {experiment.seed}, visibility `{experiment.visibility}`"
+    what = f"Run {run} of {replay.scene.log}, seed {experiment.seed}, visibility `{experiment.visibility.label}`"
     text = f"{what}. The table is over all runs and logs.\n\n{_markdown(table)}"
     text = "\n\n".join([text, *_left_out(left_out)])
     out.static(["summary"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))

@@ -280,9 +280,9 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     """However many blocks of runs, passes and files there are; of the same units and rows."""
     views: list[int] = []
 
-    def counted(world: Tracks, static: Any, observers: Any, *, flat: bool) -> Any:
+    def counted(world: Tracks, static: Any, observers: Any, model: Any) -> Any:
         views.append(len(world.frame_ix) * len(observers.carrier_ix))
-        return visible_shares(world, static, observers, flat=flat)
+        return visible_shares(world, static, observers, model)
 
     monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
     monkeypatch.setattr(stretches, "ROWS_AT_ONCE", 1)

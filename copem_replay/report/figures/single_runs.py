@@ -157,5 +157,5 @@ def _note(results: Results, choice: Choice, stories: Sequence[Story]) -> list[st
         f"onset is {stories[0].onset_s:.2f} s after the log's start",
         list_rates(results.summary, choice.configurations),
         thin,
-        f"Visibility: {experiment.visibility}",
+        f"Visibility: {experiment.visibility.label}",
     ]
