@@ -26,8 +26,10 @@ from copem_replay.core.tracks import TRUTH, Tracks
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import read
-from copem_replay.perception.visibility import NO_STATICS, Observers, visible_shares
-from copem_replay.pipeline.log_replay import believed, prepare, replay_block
+from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, visible_shares
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 
 ROOT = Path(__file__).parents[1]
 
@@ -83,9 +85,9 @@ def visibility() -> Iterator[dict[str, object]]:
     place[..., :2] = rng.uniform(-60, 60, (units, 1, 2))
     place[..., 2] = rng.choice([1.8, 5.0], (units, 1))
     observers = Observers(place, np.ones((units, frames), dtype=bool), np.full(units, -1))
-    for kind in ("flat", "surface"):
-        seconds = best(lambda kind=kind: visible_shares(world, NO_STATICS, observers, flat=kind == "flat"), 3)
-        yield {f"visibility_{kind}_views_per_s": round(units * frames * count / seconds)}
+    for model in (Flat(), Surface()):
+        seconds = best(lambda model=model: visible_shares(world, NO_STATICS, observers, model), 3)
+        yield {f"visibility_{model.kind}_views_per_s": round(units * frames * count / seconds)}
 
 
 def paper() -> Iterator[dict[str, object]]:

@@ -21,7 +21,7 @@ import numpy as np
 from copem_replay.communication.arrivals import instants
 from copem_replay.core.object_list import COVARIANCES, Lists, Reports, entries_of
 from copem_replay.core.tracks import CLASSES, Float, Tracks
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.ideal import fuse
@@ -29,7 +29,8 @@ from copem_replay.fusion.inputs import reports
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.gospa import gospa, gospa_pairs
-from copem_replay.pipeline.log_replay import blocks, prepare
+from copem_replay.pipeline.blocks import blocks
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import World, _without_truth, listen, seen_by_all
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -84,8 +85,8 @@ def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterat
     seen = [seen_by_all(world, runs, states="sampled") for runs in cut]
     told = [_without_truth(world, each, runs) for each, runs in zip(seen, cut, strict=True)]
     with ThreadPoolExecutor(2) as pool:
-        for name, configuration in world.experiment.configurations.items():
-            parts = [_fusing(world, configuration, *each) for each in zip(seen, told, strict=True)]
+        for name in world.experiment.configurations:
+            parts = [_fusing(world, name, *each) for each in zip(seen, told, strict=True)]
             work = [fused for fused, _ in parts]
             count = parts[0][1] * sum(map(len, cut))
             one = best(lambda work=work: list(map(call, work)), 2) / count
@@ -98,9 +99,10 @@ def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterat
             }
 
 
-def _fusing(world: World, configuration: Configuration, seen: Tracks, told: Lists) -> tuple[Callable[[], object], int]:
+def _fusing(world: World, name: str, seen: Tracks, told: Lists) -> tuple[Callable[[], object], int]:
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
-    heard = listen(seen, world.truth, world.experiment, configuration)
+    heard = listen(seen, world.truth, world.experiment, name)
+    configuration = world.experiment.configurations[name]
     age_s, fusion = configuration.max_age_s, configuration.fusion
     count = len(instants(heard, max_age_s=age_s).issue_s)
     if isinstance(fusion, ListFusion):

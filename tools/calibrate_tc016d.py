@@ -27,7 +27,7 @@ from copem_replay.metrics.braking.driver import ConstantDeceleration, GammaReact
 from copem_replay.metrics.braking.verdict import pass_probability, passing
 from copem_replay.metrics.survival import wilson
 from copem_replay.pipeline.closed_form import distributions
-from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.pipeline.prepare import Replay, prepare
 from make_logs import tc016d
 from paper import PASSED, RUNS
 

@@ -20,7 +20,7 @@ import pandas as pd
 from copem_replay.core.errors import CopemError
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.io.recording import Recording, read
-from copem_replay.perception.visibility import NO_STATICS, Observers, visible_shares
+from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, visible_shares
 
 WITHIN_M = 60.0
 SENSOR_HEIGHT_M = 1.9
@@ -65,8 +65,8 @@ def pedestrians(recording: Recording) -> pd.DataFrame:
         }
     )
     observers = Observers(place, present, np.array([scene.ego_ix]))
-    for kind in ("surface", "flat"):
-        table[kind] = visible_shares(truth, NO_STATICS, observers, flat=kind == "flat")[0]
+    for model in (Surface(), Flat()):
+        table[model.kind] = visible_shares(truth, NO_STATICS, observers, model)[0]
     return table[keep]
 
 

@@ -66,7 +66,7 @@ def check(
 ) -> int:
     """Report every problem of an experiment file at once, with file and line, against its recordings too."""
     from copem_replay.cli.api.study import prepared, read_study
-    from copem_replay.pipeline.oddities import notes_of
+    from copem_replay.pipeline.notes import notes_of
 
     study = read_study(source_with(experiment, {"ego": ego}, log or (), (from_s, to_s)))
     ready, warnings = prepared(study)

@@ -167,8 +167,8 @@ class Slot:
         elif ":" in kind:
             target = kind
         else:
-            known = ", ".join(self.kinds())
-            raise _problem(f"kind: expected one of {known}, or package.module:Class; found {kind!r}")
+            known = f"one of {', '.join(self.kinds())}, or " if self.kinds() else ""
+            raise _problem(f"kind: expected {known}package.module:Class; found {kind!r}")
         module, _, name = target.partition(":")
         try:
             component = getattr(importlib.import_module(module), name)
@@ -193,7 +193,8 @@ class Slot:
             value = {"kind": self.default, **value}
         if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
             found = "nothing" if value is None else repr(value)
-            raise _problem(f"expected {{kind: …}}, kind one of {', '.join(self.kinds())}; found {found}")
+            kinds = f"one of {', '.join(self.kinds())}" if self.kinds() else "package.module:Class"
+            raise _problem(f"expected {{kind: …}}, kind {kinds}; found {found}")
         component = self.find(value["kind"])
         try:
             return component.model_validate(dict(value))

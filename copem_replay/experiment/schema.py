@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
+from copem_replay.communication.link import ConstantLink, LinkModel
 from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, described
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
@@ -17,6 +18,7 @@ from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
 from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.visibility import Surface, Visibility
 
 
 def _unit_name(value: str) -> str:
@@ -79,7 +81,7 @@ class Unit(Placement):
 
 
 class Configuration(Frozen):
-    """What is compared: which units, which fusion, which latency.
+    """What is compared: which units, which fusion, which latency, by unit or not, or which `link` of the user's own.
 
     >>> late = cr.Configuration(units="all", latency_s={"ego": 0.0, "default": 0.15}, fusion={"kind": "gnn"})
     >>> late.latency_of("mast"), late.fusion.kind
@@ -89,13 +91,23 @@ class Configuration(Frozen):
     units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
     latency_s: Latency | dict[Id, Latency] = 0.0
+    link: Annotated[LinkModel, Slot("link", {})] | None = Field(default=None, exclude_if=lambda link: link is None)
     max_age_s: Positive = 1.0
 
-    def latency_of(self, unit: str) -> float:
-        """Seconds from capture to arrival of a unit's lists."""
-        if isinstance(self.latency_s, dict):
-            return self.latency_s.get(unit, self.latency_s.get("default", 0.0))
-        return self.latency_s
+    @model_validator(mode="after")
+    def _one_link(self) -> Self:
+        if self.link is not None and self.latency_s:
+            raise ValueError("link: expected either `latency_s` or `link`, found both")
+        return self
+
+    @property
+    def link_model(self) -> LinkModel:
+        """The link to the receiver: the declared one, else that of `latency_s`."""
+        return ConstantLink(latency_s=self.latency_s) if self.link is None else self.link
+
+    def latency_of(self, unit: str) -> float | None:
+        """Seconds from capture to arrival of every list of a unit; None: they differ from list to list."""
+        return self.link_model.fixed_s(unit)
 
 
 def _how_many(value: object) -> object:
@@ -243,7 +255,7 @@ class Experiment(Frozen):
     pems: dict[Id, Pem] = Field(default_factory=dict)
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()
-    visibility: Literal["surface", "flat"] = "surface"
+    visibility: Visibility = Field(default=Surface(), json_schema_extra={"default": "surface"})
     configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]
     measure: Measure = Measure()
     braking: Braking | None = None

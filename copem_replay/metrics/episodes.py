@@ -194,7 +194,7 @@ def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: Metric
         truth,
         static,
         observers(places, np.array([carrier(scene, u) for u in chosen.values()])),
-        flat=experiment.visibility == "flat",
+        experiment.visibility,
     )
     best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)
     return best

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Protocol, Self
+from typing import Annotated, Protocol, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from copem_replay.core.components import Frozen, Id, NotNegative, Number, Positive, Share
 from copem_replay.perception.pem.condition import ClassNames, Pem
+from copem_replay.perception.visibility import VisibilityModel
 
 Point = tuple[Number, Number]
 
@@ -98,8 +99,8 @@ class PerceptionSetup(Protocol):
         """States further apart than this (s) are not interpolated between."""
 
     @property
-    def visibility(self) -> Literal["surface", "flat"]:
-        """Which visible share: of the surface, or of flat outlines."""
+    def visibility(self) -> VisibilityModel:
+        """How much of each object shows."""
 
     @property
     def pems(self) -> Mapping[str, Pem]:

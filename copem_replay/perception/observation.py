@@ -138,9 +138,8 @@ def candidates(
     for names, world in worlds(scene, truth, experiment, placed, from_s, until_s):
         places = [placed.poses[name] for name in names]
         carriers = np.array([placed.carrier_ix[name] for name in names])
-        flat = experiment.visibility == "flat"
         watching = observers(places, carriers)
-        seen = partial(visible_shares, static=placed.static, observers=watching, flat=flat)
+        seen = partial(visible_shares, static=placed.static, observers=watching, model=experiment.visibility)
         shares = seen(world) if kept is None else kept.of(names[0], world, (from_s, cut_s or from_s, until_s), seen)
         for k, name in enumerate(names):
             pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])

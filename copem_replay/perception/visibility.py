@@ -3,19 +3,24 @@
 `surface`: uniform in azimuth over the target's angular extent; at each azimuth the share of the column of the
 target's nearest face, bottom to top, that no body in front of it covers. `flat`: the same with infinitely high
 bodies. A body whose footprint overlaps the target's does not hide it; a unit inside the target's footprint sees 1; a
-unit inside another body ignores that body; a unit's own carrier neither hides nor is seen. (The contract's definition.)
+unit inside another body ignores that body; a unit's own carrier neither hides nor is seen.
 The integration is in perception/visibility_kernel.py.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 
+from copem_replay.core.components import Component, Slot, asked, wrong
+from copem_replay.core.own_code import is_own
 from copem_replay.core.tracks import Bool, Float, Int, Tracks
 from copem_replay.perception.visibility_kernel import views
 
@@ -78,32 +83,142 @@ class Observers:
     carrier_ix: Int
 
 
-def visible_shares(
-    world: Tracks, static: Statics, observers: Observers, *, flat: bool, threads: int | None = None
-) -> Float:
-    """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier."""
+class VisibilityModel(Component, ABC):
+    """Base of what `visibility:` may name: how much of each object shows. A list depends on no other list."""
+
+    @abstractmethod
+    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+        """Visible share of every row of the world from every unit: (U, P), 0 … 1.
+
+        What stands where the unit is absent, or for its carrier, is not read.
+        """
+
+    def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
+        """Which body alone hides most of each row of the world from each unit: (U, P), a row of the world.
+
+        −1: none hides any of it; −2 − k: the obstacle k. For showing only; a model that does not know says none.
+        """
+        return np.full((len(observers.carrier_ix), len(world.frame_ix)), -1)
+
+    @property
+    def label(self) -> str:
+        """The model in one line: its kind, and what is not by default."""
+        said = self.model_dump(mode="json", by_alias=True, exclude={"kind"}, exclude_defaults=True)
+        return f"{self.kind} ({', '.join(f'{key}: {value}' for key, value in said.items())})" if said else self.kind
+
+
+class Surface(VisibilityModel):
+    """The share of the surface that faces the unit, with bodies as high as they are."""
+
+    kind: Literal["surface"] = "surface"
+
+    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+        """(U, P) NaN where the unit is absent or the carrier."""
+        return _shares(world, static, observers, flat=False)
+
+    def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
+        """(U, P) the body that hides most."""
+        return _blockers(world, static, observers, flat=False)
+
+
+class Flat(VisibilityModel):
+    """The share of the outline seen from above, with infinitely high bodies."""
+
+    kind: Literal["flat"] = "flat"
+
+    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+        """(U, P) NaN where the unit is absent or the carrier."""
+        return _shares(world, static, observers, flat=True)
+
+    def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
+        """(U, P) the body that hides most."""
+        return _blockers(world, static, observers, flat=True)
+
+
+BUILT_IN: dict[str, VisibilityModel] = {"surface": Surface(), "flat": Flat()}
+
+
+def _named(value: object) -> object:
+    """The model that a plain word stands for; what is said of a user's own is left to its slot."""
+    if isinstance(value, VisibilityModel | Mapping):
+        return value
+    if not isinstance(value, str) or value not in BUILT_IN:
+        raise ValueError(f"expected {' or '.join(map(repr, BUILT_IN))}, found {value!r}")
+    return BUILT_IN[value]
+
+
+def _said(model: VisibilityModel) -> object:
+    return model.kind if model.kind in BUILT_IN else model.model_dump(mode="json", by_alias=True)
+
+
+Visibility = Annotated[
+    VisibilityModel,
+    Slot("visibility", {}),
+    BeforeValidator(_named),
+    PlainSerializer(_said),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"enum": list(BUILT_IN), "type": "string"},
+                {"type": "object", "properties": {"kind": {"type": "string", "pattern": ":"}}, "required": ["kind"]},
+            ]
+        }
+    ),
+]
+"""`visibility:` of an experiment: a plain word, or a model of the user's own, `{kind: package.module:Class}`."""
+
+
+def visible_shares(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Float:
+    """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier.
+
+    Raises InputError where a model of the user's own fails, or gives no shares.
+    """
+    found = asked(model, "visibility", lambda: np.asarray(model.shares(world, static, observers), dtype=float))
+    if not is_own(type(model)):
+        return found
+    expected = (len(observers.carrier_ix), len(world.frame_ix))
+    if found.shape != expected:
+        raise wrong(model, "visibility", f"shares: expected shape {expected}, found {found.shape}", "shares")
+    seen = observers.present[:, world.frame_ix] & (world.row_object_ix != observers.carrier_ix[:, None])
+    beyond = seen & ~((found >= 0) & (found <= 1 + 1e-12))
+    if beyond.any():
+        raise wrong(model, "visibility", f"shares: expected 0 … 1, found {found[beyond][0]}", "shares")
+    return np.where(seen, found, np.nan)
+
+
+def hidden_by(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Int:
+    """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
+
+    −1: none hides any of it; −2 − k: the obstacle k. Raises InputError where a model of the user's own fails.
+    """
+    found = asked(model, "visibility", lambda: np.asarray(model.hidden_by(world, static, observers)))
+    if is_own(type(model)):
+        expected = (len(observers.carrier_ix), len(world.frame_ix))
+        least = -2 - int(static.body.max(initial=-1))
+        whole = found.shape == expected and found.dtype.kind in "iu"
+        if not whole or ((found < least) | (found >= max(expected[1], 1))).any():
+            message = f"hidden_by: expected whole numbers {least} … {expected[1] - 1} of shape {expected}"
+            raise wrong(model, "visibility", f"{message}, found {found.dtype.name} of shape {found.shape}", "hidden_by")
+    return found
+
+
+def _shares(world: Tracks, static: Statics, observers: Observers, *, flat: bool) -> Float:
     order, _bounds = world.by_frame
-    seen, _blocker = _views(world, static, observers, flat, threads, blockers=False)
+    seen, _blocker = _views(world, static, observers, flat=flat, blockers=False)
     shares = np.empty_like(seen)
     shares[:, order] = seen
     return shares
 
 
-def hidden_by(world: Tracks, static: Statics, observers: Observers, *, flat: bool, threads: int | None = None) -> Int:
-    """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
-
-    −1: none hides any of it; −2 − k: the obstacle k.
-    """
+def _blockers(world: Tracks, static: Statics, observers: Observers, *, flat: bool) -> Int:
     order, _bounds = world.by_frame
-    _seen, found = _views(world, static, observers, flat, threads, blockers=True)
+    _seen, found = _views(world, static, observers, flat=flat, blockers=True)
     blocker = np.empty_like(found)
     blocker[:, order] = np.where(found >= 0, order[found], found) if len(order) else found
     return blocker
 
 
-def _views(
-    world: Tracks, static: Statics, observers: Observers, flat: bool, threads: int | None, *, blockers: bool
-) -> tuple[Float, Int]:
+def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, blockers: bool) -> tuple[Float, Int]:
     """Shares and blockers (U, P), rows list by list; blockers empty unless asked for."""
     order, bounds = world.by_frame
     n_units, n_frames = observers.present.shape
@@ -117,7 +232,7 @@ def _views(
         static.xy_m, static.start, static.body, static.bottom_m, static.top_m,
         np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present), observers.carrier_ix, flat,
     )  # fmt: skip
-    threads = threads or min(8, os.cpu_count() or 1)
+    threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
     cuts = np.searchsorted(bounds, np.linspace(0, len(order), pieces + 1)[1:-1])

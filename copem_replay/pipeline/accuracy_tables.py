@@ -21,7 +21,7 @@ import pyarrow as pa
 
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, total
-from copem_replay.pipeline.log_replay import Outcome
+from copem_replay.pipeline.blocks import Outcome
 from copem_replay.pipeline.scoring import Appraisal
 
 

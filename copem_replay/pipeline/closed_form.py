@@ -3,8 +3,8 @@
 Lists are independent given the truth, and with ideal fusion an object is known when any list that has arrived holds it:
 P(T > t) = Π (1 − p) over all lists that have arrived by t. Confirmation by k of n is a Markov chain over the last n − 1
 capture instants where all units capture together and their lists arrive together; elsewhere it has no such form, and is
-refused. Both are worked out in metrics/log_survival.py. With the reaction's distribution follow the probabilities to pass and to
-fail. docs/measures.md has the definitions.
+refused. Both are worked out in metrics/log_survival.py. With the distribution of the reaction follow the probabilities
+to pass and to fail. docs/measures.md has the definitions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from copem_replay.metrics.detections_table import distances
 from copem_replay.metrics.episodes import ENDED_BY
 from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
 from copem_replay.pipeline.expansion import fleet_of
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import by_truth, listen
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
@@ -75,15 +75,15 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
         return
     for replay in ready:
         units = fleet_of(experiment, replay.scene).experiment
-        for name, configuration in units.configurations.items():
-            _shared_instants(replay, listen(replay.measured.tracks, replay.truth, units, configuration), name)
+        for name in units.configurations:
+            _shared_instants(replay, listen(replay.measured.tracks, replay.truth, units, name), name)
 
 
 def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
     """For each look when it is first known."""
     experiment = fleet_of(experiment, replay.scene).experiment
     configuration, looks, confirm = experiment.configurations[name], replay.looks, experiment.measure.confirm
-    heard = listen(replay.measured.tracks, replay.truth, experiment, configuration)
+    heard = listen(replay.measured.tracks, replay.truth, experiment, name)
     # A model of the user's own may be above 1 by rounding.
     listed = (
         np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)

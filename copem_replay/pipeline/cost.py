@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from numba.core.event import Event, Listener, install_listener
 
-from copem_replay.pipeline.log_replay import Outcome
+from copem_replay.pipeline.blocks import Outcome
 
 MOSTLY = 0.5
 LONG_S = 10.0

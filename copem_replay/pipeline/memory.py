@@ -9,7 +9,7 @@ from pathlib import Path
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 
 AT_LEAST_BYTES = {False: 250, True: 400}
 """Of a row of `detections.parquet`, without accuracy and with it, while all are put together (measured: 146 and 234 of

@@ -89,20 +89,20 @@ def seen_by_all(world: World, runs: Int, *, states: States, equipped: Bool | Non
     return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
 
 
-def listen(
-    seen: Tracks, truth: Tracks, experiment: Experiment, configuration: Configuration, there: Bool | None = None
-) -> Tracks:
-    """What reaches the receiver in one configuration: the lists of its units, late; those of the others never.
+def listen(seen: Tracks, truth: Tracks, experiment: Experiment, name: str, there: Bool | None = None) -> Tracks:
+    """What reaches the receiver of the configuration `name`: the lists of its units, late; those of the others never.
 
     `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn
-    for them.
+    for them. Raises InputError where a link of the user's own fails.
     """
+    configuration = experiment.configurations[name]
+    link, where = configuration.link_model, f"configurations.{name}.link"
     if configuration.units == TRUTH:
-        return transmit(truth, configuration.latency_of)
+        return transmit(truth, link, where)
     heard = set(experiment.units_of(configuration))
     if there is not None:
         heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
-    return transmit(seen, lambda unit: configuration.latency_of(unit) if unit in heard else np.inf)
+    return transmit(seen, link, where, heard)
 
 
 def by_truth(configuration: Configuration) -> bool:
@@ -144,7 +144,7 @@ class Receivers:
             max_age_s = configuration.max_age_s
             posterior = isinstance(fusion, Ideal) and fusion.combine == "posterior" and not of_truth
             states: States = "expected" if posterior else "sampled"
-            heard = listen(seen_in(states), world.truth, experiment, configuration, self._there)
+            heard = listen(seen_in(states), world.truth, experiment, name, self._there)
             if name not in self._instants:
                 self._instants[name] = instants(heard, max_age_s=max_age_s)
             at = self._instants[name].between(world.stretch.from_s, world.stretch.until_s)

@@ -16,13 +16,14 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.fixed import fixed_in
 from copem_replay.metrics.summary import horizon_s, summary
-from copem_replay.pipeline import log_replay as replays
 from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
+from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
 from copem_replay.pipeline.closed_form import check_exact, exact_table
 from copem_replay.pipeline.cost import Cost, watched
-from copem_replay.pipeline.log_replay import Outcome, Replay
+from copem_replay.pipeline.list_rates import list_rates
 from copem_replay.pipeline.memory import memory_notes
-from copem_replay.pipeline.oddities import notes_of, same_units
+from copem_replay.pipeline.notes import notes_of, same_units
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.sweep import Point, points
 
 Progress = Callable[[int, int], None]
@@ -59,7 +60,7 @@ def run(
     """
     with watched() as cost:
         if ready is None:
-            ready = [replays.prepare(recording, experiment) for recording in recordings]
+            ready = [prepare(recording, experiment) for recording in recordings]
             check_closed_form(ready, experiment)
             memory_notes(ready, experiment)
         tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)), cost)
@@ -104,7 +105,7 @@ def _at_point(
     """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
     experiment = point.experiment
     if not point.same_units:
-        ready = [replays.prepare(recording, experiment) for recording in recordings]
+        ready = [prepare(recording, experiment) for recording in recordings]
     table, parts, _ = tables.of(ready, experiment)
     rows, _ = summary(
         table,
@@ -137,11 +138,11 @@ class _Tables:
         self, ready: Sequence[Replay], experiment: Experiment
     ) -> tuple[pd.DataFrame, list[Outcome], NDArray[np.int64]]:
         """The rows of `detections.parquet` of an experiment; all outcomes, and the order their rows have got."""
-        work = [(replay, block) for replay in ready for block in replays.blocks(replay, experiment, self._jobs)]
+        work = [(replay, block) for replay in ready for block in blocks(replay, experiment, self._jobs)]
         parts: list[list[Outcome]] = []
         pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
         try:
-            for part in pool.map(lambda item: replays.outcomes(item[0], experiment, item[1]), work):
+            for part in pool.map(lambda item: outcomes(item[0], experiment, item[1]), work):
                 parts.append(part)
                 if self._progress is not None:
                     self._progress(self._done * len(work) + len(parts), self._tables * len(work))
@@ -163,7 +164,7 @@ def _order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> NDAr
 
 
 def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float | None]:
-    rates = [replays.list_rates(replay, experiment) for replay in ready]
+    rates = [list_rates(replay, experiment) for replay in ready]
     return {name: _rate([of_log[name] for of_log in rates]) for name in experiment.configurations}
 
 

@@ -10,7 +10,8 @@ import pandas as pd
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.expansion import of_run
-from copem_replay.pipeline.log_replay import Beliefs, Replay, prepare
+from copem_replay.pipeline.one_run import Beliefs
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import Result
 
 STEM = "replay"

@@ -10,7 +10,7 @@ from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Candidates
 from copem_replay.perception.sensor_poses import carrier
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 
 BY_EGO, BY_ANY = "ego", "any unit"
 """Whose share a curve is: the best of the ego's units, the best of all."""

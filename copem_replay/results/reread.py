@@ -11,7 +11,7 @@ from copem_replay.experiment.validate import read_logs
 from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Objects
-from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.pipeline.prepare import Replay, prepare
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results

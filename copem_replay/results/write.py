@@ -169,7 +169,7 @@ def provenance_of(
             {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.path)} for r in recordings
         ],
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
-        "visibility": experiment.visibility,
+        "visibility": experiment.visibility.label,
         "max_gap_s": experiment.max_gap_s,
         "window_s": experiment.window_s,
         "measure": experiment.measure.model_dump(mode="json", by_alias=True) | {"horizon_used_s": result.horizon_s},

@@ -9,7 +9,7 @@ import pandas as pd
 
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.camera import FOLLOWED, Eye
 from copem_replay.viewer.sink import ELAPSED, digest, ns, part_of, path_of, short_ids
 

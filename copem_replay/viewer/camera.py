@@ -11,7 +11,7 @@ from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.sensor_poses import carrier, moved
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import Out, f32, ns
 
 FARTHEST_AHEAD_M = 12.0

@@ -13,7 +13,7 @@ from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.metrics.gospa import gospa
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.scoring import settings_of
 from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve
 from copem_replay.viewer.boxes import EGO

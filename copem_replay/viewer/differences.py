@@ -22,7 +22,7 @@ from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import Out, f32, ns, part_of
 
 GAINED: Rgb = (0, 158, 115)

@@ -16,7 +16,7 @@ from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import Reference
 from copem_replay.perception.sensor_poses import carrier
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve
 from copem_replay.viewer.sink import Out, f32, ns, part_of, short_ids
 from copem_replay.viewer.text_panels import verdict_of

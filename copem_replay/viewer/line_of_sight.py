@@ -15,7 +15,7 @@ from copem_replay.perception.pem.condition import Condition, Couple
 from copem_replay.perception.sensor_poses import Poses, carrier, observers, poses, unit_ground
 from copem_replay.perception.visibility import hidden_by, visible_shares
 from copem_replay.pipeline.chunking import ROWS_A_STRETCH
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import f32
 
 CLEAR_ABOVE = 0.5
@@ -74,7 +74,7 @@ def _look_at(replay: Replay, experiment: Experiment, seen: Sight, part: slice, o
             continue
         at = poses(scene, unit, world, unit_ground(truth, name, unit, []))
         watching = observers([at], np.array([carrier(scene, unit)]))
-        [share] = visible_shares(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
+        [share] = visible_shares(world, replay.placed.static, watching, experiment.visibility)
         look = _look(at, world, rows, scene.object_class[world.row_object_ix[rows]])
         pem = experiment.pems[str(unit.pem)]
         in_field = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
@@ -113,7 +113,7 @@ def _hidden(
     world = _world(replay, experiment, seen.elapsed_ns[frames])
     then = Poses(*(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
     watching = observers([then], np.array([carrier(replay.scene, unit)]))
-    [hides] = hidden_by(world, replay.placed.static, watching, flat=experiment.visibility == "flat")
+    [hides] = hidden_by(world, replay.placed.static, watching, experiment.visibility)
     rows, column = _rows(world, seen.object_ix.tolist())
     kept = hides[rows] != -1  # nothing hides any of it
     rows, column = rows[kept], column[kept]

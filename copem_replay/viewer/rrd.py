@@ -16,7 +16,7 @@ from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import share_curves
 from copem_replay.viewer import (
     blueprint,
@@ -197,7 +197,7 @@ def _properties(
         run=run,
         run_is=run_is,
         seed=experiment.seed,
-        visibility=experiment.visibility,
+        visibility=experiment.visibility.label,
         configurations=configurations,
         copem_replay=version("copem-replay"),
         rerun_sdk=version("rerun-sdk"),

@@ -10,7 +10,7 @@ from copem_replay.core.tracks import Float, Tracks
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.pem.condition import Condition, Couple
 from copem_replay.perception.sensor_poses import Poses, carrier, list_instants, mounting_height, unit_ground
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.boxes import EGO
 from copem_replay.viewer.sink import Out, f32, upright
 

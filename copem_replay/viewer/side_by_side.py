@@ -15,7 +15,8 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.tracks import SAME_INSTANT_NS
-from copem_replay.pipeline.log_replay import prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.selected_runs import STEM, OneRun, one_run
 from copem_replay.results.compare.comparable import check_comparable
 from copem_replay.results.compare.inputs import read_folders

@@ -31,7 +31,7 @@ from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.line_of_sight import CLEAR_ABOVE, Sight
 from copem_replay.viewer.sink import elapsed_ns, ns
 

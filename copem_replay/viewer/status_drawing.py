@@ -12,7 +12,7 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.tracks import TRUTH, Bool, Int, Scene
 from copem_replay.experiment.schema import Configuration, Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.event_markers import ONSET
 from copem_replay.viewer.line_of_sight import Sight
 from copem_replay.viewer.sensors import unit_places

@@ -10,7 +10,7 @@ import pandas as pd
 
 from copem_replay.core.tracks import Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import Out, ns, part_of, short_ids
 
 _ENDINGS = {
@@ -154,7 +154,7 @@ def summary(
     """Which run this is, and the table over all runs and logs, configurations side by side."""
     import rerun as rr
 
-    what = f"Run {run} of {replay.scene.log}, seed {experiment.seed}, visibility `{experiment.visibility}`"
+    what = f"Run {run} of {replay.scene.log}, seed {experiment.seed}, visibility `{experiment.visibility.label}`"
     text = f"{what}. The table is over all runs and logs.\n\n{_markdown(table)}"
     text = "\n\n".join([text, *_left_out(left_out)])
     out.static(["summary"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))

@@ -15,7 +15,9 @@ from copem_replay.core.random import Address, Dice, normal_quantile, object_word
 from copem_replay.core.tracks import Tracks
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.accuracy_tables import with_accuracy
-from copem_replay.pipeline.log_replay import believed, blocks, outcomes, prepare
+from copem_replay.pipeline.blocks import blocks, outcomes
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from copem_replay.communication.arrivals import instants
-from copem_replay.communication.link import transmit
+from copem_replay.communication.link import ConstantLink, transmit
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.ideal import draw_posterior, fuse
@@ -292,7 +292,7 @@ def beliefs(probability: float, log: Recording, without: int = -1) -> dict[str, 
     result = {}
     for combine in ("samples", "posterior"):
         seen = perceive(log.scene, found, plan, RUNS, states="sampled" if combine == "samples" else "expected")
-        belief = fuse(transmit(seen, lambda unit: 0.0), max_age_s=1.0, without_object_ix=without)
+        belief = fuse(transmit(seen, ConstantLink(), "link"), max_age_s=1.0, without_object_ix=without)
         drawn = draw_posterior(belief, log.scene, plan.seed, RUNS) if combine == "posterior" else belief
         result[combine] = drawn.fused
     return result

@@ -19,7 +19,7 @@ from copem_replay.core.yaml import dump
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import Believed, believe
 from copem_replay.pipeline.run import Result, run
 from tests.helpers.recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording

@@ -33,7 +33,9 @@ from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write import osi_sensor_data as sensor_data
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
 from copem_replay.io.write.message_family import family_of
-from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import Replay, prepare
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "logs/tc016d.mcap"

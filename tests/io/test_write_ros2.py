@@ -25,7 +25,9 @@ from copem_replay.io.recording import Recording, read
 from copem_replay.io.write.autoware_objects import LABELS
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, write_mcap
 from copem_replay.io.write.message_family import family_of
-from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS

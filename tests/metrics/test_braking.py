@@ -37,7 +37,8 @@ from copem_replay.metrics.braking.driver import (
 )
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import braked, fail_probability, judge, pass_probability, passing
-from copem_replay.pipeline.log_replay import prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.scenes import EGO_UNIT, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.oracles.braking import Motion, corners, outcome

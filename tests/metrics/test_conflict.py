@@ -32,7 +32,9 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.braking.encounter import EgoCourse
 from copem_replay.metrics.config import Conflict
 from copem_replay.metrics.detection.conflict import _will_be_in, corridors
-from copem_replay.pipeline.log_replay import believed, prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of

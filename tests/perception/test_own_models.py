@@ -15,7 +15,8 @@ from copem_replay.core.view_geometry import Errors, Look, Noise
 from copem_replay.fusion.base import Inbox, StepFusion
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel
-from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
 

@@ -15,8 +15,10 @@ from copem_replay.core.tracks import Tracks
 from copem_replay.io.recording import read
 from copem_replay.perception.visibility import (
     NO_STATICS,
+    Flat,
     Observers,
     Statics,
+    Surface,
     box_corners,
     hidden_by,
     statics,
@@ -59,7 +61,7 @@ def shares(
     world: Tracks, observer: Sequence[float], static: Statics = NO_STATICS, *, flat: bool, carrier: int = -1
 ) -> np.ndarray:
     """(P,) shares from one place."""
-    return visible_shares(world, static, at(observer, carrier), flat=flat)[0]
+    return visible_shares(world, static, at(observer, carrier), Flat() if flat else Surface())[0]
 
 
 def at(observer: Sequence[float], carrier: int = -1) -> Observers:
@@ -146,7 +148,7 @@ def test_highway_merge_gives_the_published_table() -> None:
     ego = np.flatnonzero(truth.row_object_ix == scene.ego_ix)
     place = np.stack([truth.x_m[0, ego], truth.y_m[0, ego], np.full(len(ego), 1.8)], axis=-1)[None]
     there = np.ones((1, len(ego)), dtype=bool)
-    share = visible_shares(truth, wall, Observers(place, there, np.array([scene.ego_ix])), flat=True)[0]
+    share = visible_shares(truth, wall, Observers(place, there, np.array([scene.ego_ix])), Flat())[0]
 
     def shares_at(frame: int) -> dict[str, float]:
         rows = np.flatnonzero(truth.frame_ix == frame)
@@ -240,7 +242,7 @@ def test_who_hides_whom() -> None:
         ]
     )
     house = statics([np.array([(-5, 10), (5, 10), (5, 12), (-5, 12)])], [0.0], [9.0])
-    assert hidden_by(world, house, at((0, 0, 1)), flat=False)[0].tolist() == [2, -1, 1, -2, -1]
+    assert hidden_by(world, house, at((0, 0, 1)), Surface())[0].tolist() == [2, -1, 1, -2, -1]
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -255,4 +257,4 @@ def test_a_wall_from_far_behind_to_the_front_hides_what_is_ahead(side: int) -> N
     free, hidden = math.atan(7 / 20) + math.atan(0.05), math.atan(3 / 20) - math.atan(0.05)
     assert seen == pytest.approx(free / (free + hidden), abs=1e-3)
     assert wall == 1
-    assert hidden_by(world, NO_STATICS, at((0, 0, 1)), flat=True)[0].tolist() == [1, -1]
+    assert hidden_by(world, NO_STATICS, at((0, 0, 1)), Flat())[0].tolist() == [1, -1]

@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import copem_replay.pipeline.log_replay as replays
 from copem_replay.io.recording import Recording
+from copem_replay.pipeline import blocks as blocks_module
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
-from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.scoring import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -232,7 +233,7 @@ class TestWhatIsThere:
             if name in ("union", "gnn"):
                 pd.testing.assert_series_equal(first, table.set_index(KEYS)["detection_s"].dropna(), check_exact=True)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(replays, "BLOCK_BYTES", 1)
+            patch.setattr(blocks_module, "BLOCK_BYTES", 1)
             other = run(plan, [street("one", 10)], jobs=2)
         pd.testing.assert_frame_equal(result.summary, other.summary, check_exact=True)
         pd.testing.assert_frame_equal(result.table, other.table, check_exact=True)

@@ -28,7 +28,8 @@ from copem_replay.perception.visibility import visible_shares
 from copem_replay.pipeline import chunking as stretches
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.chunking import Reach
-from copem_replay.pipeline.log_replay import Beliefs, prepare
+from copem_replay.pipeline.one_run import Beliefs
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import listen, seen_by_all
 from copem_replay.pipeline.run import Result, run
 from tests.helpers import scenes
@@ -232,7 +233,7 @@ def test_stretches_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(rows) <= 40
     alone = Beliefs(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
     assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
-    monkeypatch.setattr("copem_replay.pipeline.log_replay.ROWS_HELD", 40)
+    monkeypatch.setattr("copem_replay.pipeline.one_run.ROWS_HELD", 40)
     with pytest.raises(Exception, match="too long to be held at once; take a window of it"):
         Beliefs(replay, experiment(), 0).whole()
 
@@ -279,14 +280,14 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     """However many blocks of runs, passes and files there are; of the same units and rows."""
     views: list[int] = []
 
-    def counted(world: Tracks, static: Any, observers: Any, *, flat: bool) -> Any:
+    def counted(world: Tracks, static: Any, observers: Any, model: Any) -> Any:
         views.append(len(world.frame_ix) * len(observers.carrier_ix))
-        return visible_shares(world, static, observers, flat=flat)
+        return visible_shares(world, static, observers, model)
 
     monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
     monkeypatch.setattr(stretches, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(stretches, "ROWS_A_STRETCH", 60)
-    monkeypatch.setattr("copem_replay.pipeline.log_replay.BLOCK_BYTES", 1)
+    monkeypatch.setattr("copem_replay.pipeline.blocks.BLOCK_BYTES", 1)
     plan = experiment(runs=3, configurations={"late": {"units": "all", "latency_s": 0.4}}, pems={"sure": NOISY})
     result = run(plan, [traffic()])
     [replay] = result.replays
@@ -324,7 +325,7 @@ def test_a_stretch_reaches_back_to_a_list_that_another_unit_still_goes_by() -> N
     replay = prepare(traffic(), plan)
     lists = replay.lists_only(plan)
     seen = seen_by_all(lists, np.arange(1), states="true")
-    heard = {"ideal": listen(seen, lists.truth, lists.experiment, lists.experiment.configurations["ideal"])}
+    heard = {"ideal": listen(seen, lists.truth, lists.experiment, "ideal")}
     assert Reach(plan, heard).earliest_s(Stretch(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 

@@ -39,7 +39,8 @@ from copem_replay.metrics.detection.by_truth_id import detect
 from copem_replay.metrics.summary import summary
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, quantile_with_never
 from copem_replay.pipeline.closed_form import distributions, exact_table
-from copem_replay.pipeline.log_replay import Replay, listen, prepare
+from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.pipeline.receiver import listen
 from copem_replay.pipeline.run import Result, run
 from tests.helpers.experiments import changed, drive, source_of
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -203,7 +204,7 @@ def by_detect(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, T
         valid[:, chance] = outcomes
         weight = np.where(outcomes, probability[chance], 1 - probability[chance]).prod(axis=1)
         found = detect(
-            listen(replace(tracks, valid=valid), ready.truth, plan, configuration),
+            listen(replace(tracks, valid=valid), ready.truth, plan, name),
             ready.looks,
             confirm=plan.measure.confirm,
             count_earlier=plan.measure.count_earlier,

@@ -20,7 +20,7 @@ from copem_replay.fusion.inputs import reports
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match
 from copem_replay.pipeline.conversions import as_belief
-from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import World, _without_truth, believe, seen_by_all
 from tests.helpers.reports import lists_of, reports_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing

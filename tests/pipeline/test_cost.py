@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from copem_replay.cli import main as cli
+from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.cost import Cost
-from copem_replay.pipeline.log_replay import outcomes, prepare
+from copem_replay.pipeline.prepare import prepare
 from tests.helpers.experiments import changed, drive
 from tests.helpers.scenes import experiment, oncoming_car
 

@@ -29,9 +29,11 @@ from copem_replay.experiment.validate import against_log, problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.accuracy_tables import with_accuracy
+from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.closed_form import distributions, exact_table
 from copem_replay.pipeline.expansion import Fleet, fleet_of, of_run
-from copem_replay.pipeline.log_replay import Replay, list_rates, outcomes, prepare
+from copem_replay.pipeline.list_rates import list_rates
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording

@@ -11,15 +11,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import copem_replay.pipeline.log_replay as replays
 from copem_replay.cli import main as cli
+from copem_replay.communication.link import ConstantLink, transmit
 from copem_replay.core.object_list import ENTRY, Lists
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import ListFusion, fused_by
 from copem_replay.fusion.inputs import reports
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.log_replay import prepare
-from copem_replay.pipeline.receiver import Believed, _without_truth, believe, listen, seen_by_all
+from copem_replay.pipeline import blocks as blocks_module
+from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.receiver import Believed, _without_truth, believe, seen_by_all
 from copem_replay.pipeline.run import Result, run
 from tests.helpers.experiments import changed, drive
 from tests.helpers.reports import reports_of
@@ -102,7 +103,7 @@ class TestWhatDoesNotMatter:
         world = prepare(crowd(), plan).world(plan)
         seen = seen_by_all(world, runs, states="sampled")
         lists = _without_truth(world, seen, runs)
-        heard = listen(seen, world.truth, plan, Configuration(units="all", latency_s=latency_s))
+        heard = transmit(seen, ConstantLink(latency_s=latency_s), "link")
         told = reports(heard, lists, max_age_s=1.0)
         dice = np.random.default_rng(0)
         names = tuple(told.units[k] for k in (2, 0, 1))
@@ -132,8 +133,8 @@ class TestWhatDoesNotMatter:
         logs = [crowd(), crowd("again")]
         one = run(plan, logs)
         for jobs, size in ((3, 200_000_000), (1, 400 * 3 * 200), (2, 1)):
-            monkeypatch.setattr(replays, "BLOCK_BYTES", size)
-            assert len(replays.blocks(one.replays[0], plan, jobs)) > 1
+            monkeypatch.setattr(blocks_module, "BLOCK_BYTES", size)
+            assert len(blocks_module.blocks(one.replays[0], plan, jobs)) > 1
             other = run(plan, logs, jobs=jobs)
             pd.testing.assert_frame_equal(one.table, other.table, check_exact=True)
             pd.testing.assert_frame_equal(one.summary, other.summary, check_exact=True)

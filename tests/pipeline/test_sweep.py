@@ -25,7 +25,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.accuracy.metrics import FIGURES
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.closed_form import exact_table
-from copem_replay.pipeline.log_replay import Replay, prepare
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from copem_replay.pipeline.sweep import KINDS, Point, points, resolved
 from tests.helpers.experiments import changed, drive, source_of

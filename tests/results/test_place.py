@@ -164,7 +164,7 @@ class TestOneWriter:
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         with place.taken(here / "out/e", overwrite=False):
-            monkeypatch.setattr(runs.replays, "outcomes", raises(errno.EIO))
+            monkeypatch.setattr(runs, "outcomes", raises(errno.EIO))
             ended = call("run", "e.yaml")
         assert ended.code == 2
         assert ended.lines == [

@@ -19,7 +19,8 @@ from copem_replay.core.time_chunk import WHOLE
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
-from copem_replay.pipeline import log_replay as replays
+from copem_replay.pipeline import blocks as blocks_module
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
 from copem_replay.results.write import write_results
@@ -236,7 +237,7 @@ def made_up(times: list[float | None]) -> Result:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
     of = {"log": "scene", "configuration": "PEM", "object_id": "a"}
     table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
-    ready = replays.prepare(scenes.oncoming_car(), experiment())
+    ready = prepare(scenes.oncoming_car(), experiment())
     return Result(table, pd.DataFrame(), (), (ready,), 9.0)
 
 
@@ -333,19 +334,19 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     for accuracy in (False, True):
         measure = {"onset": {"kind": "appears"}, "objects": {"ids": ["a"]}, "accuracy": accuracy}
         many = experiment(runs=100, measure=measure, pems={"sure": NOISY})
-        ready = replays.prepare(log, many)
+        ready = prepare(log, many)
         candidates = ready.found(WHOLE) if accuracy else ready.measured
         rows = len(candidates.tracks.frame_ix)
         assert rows == (62 if accuracy else 31)
         whole = run(many, [log])
         with monkeypatch.context() as patch:
-            patch.setattr(replays, "BLOCK_BYTES", 7 * rows * (replays.STATE_BYTES if accuracy else 1))
-            cut = replays.blocks(ready, many, jobs=1)
+            patch.setattr(blocks_module, "BLOCK_BYTES", 7 * rows * (blocks_module.STATE_BYTES if accuracy else 1))
+            cut = blocks_module.blocks(ready, many, jobs=1)
             assert max(map(len, cut)) == 7
             assert np.concatenate(cut).tolist() == list(range(100))
             in_sevens = run(many, [log])
-            patch.setattr(replays, "BLOCK_BYTES", 1)
-            assert set(map(len, replays.blocks(ready, many, jobs=1))) == {1}
+            patch.setattr(blocks_module, "BLOCK_BYTES", 1)
+            assert set(map(len, blocks_module.blocks(ready, many, jobs=1))) == {1}
             for cut_up in (in_sevens, run(many, [log])):
                 assert cut_up.table.equals(whole.table)
                 assert cut_up.summary.equals(whole.summary)

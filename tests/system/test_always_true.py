@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from copem_replay.core.interpolation import states_at
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.scenes import Thing, driving, experiment, recording
 

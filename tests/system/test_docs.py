@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 
 from copem_replay.cli import main as cli
+from copem_replay.communication.link import transmit
 from copem_replay.core.view_geometry import Look
 from copem_replay.experiment.file import load, parse
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import StepFusion
 from copem_replay.fusion.testing.check import check_fusion
 from copem_replay.perception.pem.detection import DetectionModel
-from copem_replay.pipeline.log_replay import believed, prepare
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
@@ -112,6 +114,12 @@ def test_own_error_model_of_the_architecture_page_works(architecture: ModuleType
     assert fused.yaw_var_rad2[0, rows] == pytest.approx(0.05**2)
     off_m = (fused.x_m[0, rows] - away_m) / (0.1 * away_m)
     assert 0.5 < np.std(off_m[away_m > 1]) < 1.5
+
+
+def test_own_link_of_the_architecture_page_works(architecture: ModuleType) -> None:
+    filling = architecture.Filling(kind="page:Filling", per_s=0.5)
+    late = transmit(scenes.oncoming_car().truth, filling, "link")
+    assert late.arrives_s[0, [0, 40, 80]] == pytest.approx([0.0, 6.0, 12.0])
 
 
 def test_own_fusion_of_the_fusion_page_works() -> None:

@@ -11,7 +11,7 @@ from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.log_replay import prepare
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 
 FILE = Path(__file__).parents[2] / "logs/tc016d.yaml"

@@ -15,7 +15,9 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording, read
-from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.line_of_sight import sight
 from copem_replay.viewer.selection import SHOWN_OBJECTS, telling

@@ -24,7 +24,9 @@ from copem_replay.core.errors import OutputError
 from copem_replay.core.fused_tracks import Belief
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.log_replay import Replay, believed, prepare, replay_block
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.rrd import telling
 from copem_replay.viewer.sink import ELAPSED, TIME

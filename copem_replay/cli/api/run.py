@@ -23,7 +23,7 @@ from copem_replay.pipeline.run import Progress, Result
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from copem_replay.pipeline.log_replay import Replay
+    from copem_replay.pipeline.prepare import Replay
     from copem_replay.results.place import Place
 
 
@@ -189,7 +189,7 @@ def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> p
     >>> seen.loc[seen["since_onset_s"].between(0.55, 0.75), "visible_share"].round(2).tolist()
     [0.18, 0.37]
     """
-    from copem_replay.pipeline.log_replay import prepare
+    from copem_replay.pipeline.prepare import prepare
 
     study = study_of(experiment, recording)
     replay = prepare(study.recordings[0], study.experiment)

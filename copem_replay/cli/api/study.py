@@ -16,7 +16,7 @@ from copem_replay.experiment.validate import across_logs, against_log, log_names
 from copem_replay.io.recording import Recording
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
-    from copem_replay.pipeline.log_replay import Replay
+    from copem_replay.pipeline.prepare import Replay
 
 AnyPath: TypeAlias = str | PathLike[str]
 AnyExperiment: TypeAlias = Experiment | Mapping[str, Any] | AnyPath
@@ -144,8 +144,8 @@ def prepared(study: Study) -> tuple[list[Replay], list[str]]:
 
     Raises ExperimentError for what cannot be done with them: times without a closed form, runs that no memory holds.
     """
-    from copem_replay.pipeline.log_replay import prepare
     from copem_replay.pipeline.memory import memory_notes
+    from copem_replay.pipeline.prepare import prepare
 
     ready = [prepare(recording, study.experiment) for recording in study.recordings]
     key: tuple[str, ...] = ("measure", "exact")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from copem_replay.core.tracks import Float
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import BY_EGO, share_curves
 from copem_replay.report.figures.captions import list_rates, short_names
 from copem_replay.report.figures.label_layout import STEP_IN, draw_labels, last_instant, mark
@@ -158,5 +158,5 @@ def _note(results: Results, choice: Choice, stories: Sequence[Story]) -> list[st
         f"onset is {stories[0].onset_s:.2f} s after the log's start",
         list_rates(results.summary, choice.configurations),
         thin,
-        f"Visibility: {experiment.visibility}",
+        f"Visibility: {experiment.visibility.label}",
     ]

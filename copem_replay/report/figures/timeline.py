@@ -17,7 +17,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Driver
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.config import InRange, LineOfSight, StartsMoving
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.report.figures.trajectories import Course, braked_course, recorded_course
 
 _STOOD_MPS = 0.05

@@ -16,7 +16,7 @@ from copem_replay.metrics.braking.driver import Driver
 from copem_replay.metrics.braking.ego_path import EgoCourse
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import braked
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 
 _SAME_S = SAME_INSTANT_NS * 1e-9
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from copem_replay.core.components import Component
 from copem_replay.core.text import counted
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.io.window import in_words
@@ -120,18 +121,23 @@ def configurations(study: Study) -> Html:
 
 def _fusion(configuration: Configuration) -> str:
     """Its kind, and what is not by default."""
-    fusion = configuration.fusion
-    said = fusion.model_dump(mode="json", by_alias=True)
+    return _component(configuration.fusion)
+
+
+def _component(component: Component) -> str:
+    said = component.model_dump(mode="json", by_alias=True)
     kind = str(said.pop("kind"))
-    plain = {key: field.get_default() for key, field in type(fusion).model_fields.items()}
+    plain = {key: field.get_default() for key, field in type(component).model_fields.items()}
     other = [f"{key}: {value}" for key, value in said.items() if value != plain.get(key)]
     return f"{kind} ({', '.join(other)})" if other else kind
 
 
 def _latency(configuration: Configuration, units: Sequence[str]) -> str:
+    if configuration.link is not None:
+        return _component(configuration.link)
     if not isinstance(configuration.latency_s, dict):
         return f"{configuration.latency_s:g} s"
     by: dict[float, list[str]] = {}
     for unit in units:
-        by.setdefault(configuration.latency_of(unit), []).append(unit)
+        by.setdefault(configuration.latency_of(unit) or 0.0, []).append(unit)
     return "; ".join(f"{some(of)} {latency_s:g} s" for latency_s, of in by.items())

@@ -19,7 +19,7 @@ from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
 from copem_replay.perception.pem.condition import Pem
 from copem_replay.perception.sensor_poses import Poses
-from copem_replay.pipeline.log_replay import Replay
+from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import without_points
 
 FAR_M = 2000.0
@@ -66,7 +66,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
-        late = [unit for unit in units if configuration.latency_of(unit) > end_s]
+        late = [unit for unit in units if (configuration.latency_of(unit) or 0.0) > end_s]
         if late:
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
 

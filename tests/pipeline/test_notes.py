@@ -12,9 +12,9 @@ from copem_replay.experiment.file import log_paths
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import memory, oddities
-from copem_replay.pipeline.log_replay import Replay, prepare
-from copem_replay.pipeline.oddities import notes_of
+from copem_replay.pipeline import memory, notes
+from copem_replay.pipeline.notes import notes_of
+from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.experiments import TEXT, changed, drive, source_of
 from tests.helpers.recordings import Obj, write_recording
@@ -107,8 +107,8 @@ def test_check_says_it_as_run_does(here: Path, change: str, said: list[str]) -> 
 def test_a_single_encounter_is_found_wherever_it_is(
     here: Path, monkeypatch: pytest.MonkeyPatch, rows: int, sample: int, rate: str, when: str, unmet: str
 ) -> None:
-    monkeypatch.setattr(oddities, "_ROWS", rows)
-    monkeypatch.setattr(oddities, "_SAMPLE", sample)
+    monkeypatch.setattr(notes, "_ROWS", rows)
+    monkeypatch.setattr(notes, "_SAMPLE", sample)
     ego = f"  ego: {{on: ego, height_m: 1.8, pem: onboard{rate}}}"
     assert before(here, changed(couple(when), ego)) == [f"drive: unit {unmet}: {UNMET}"]
 

@@ -1,0 +1,30 @@
+"""How often the receiver of each configuration issues a fused list."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from copem_replay.communication.arrivals import instants
+from copem_replay.core.tracks import SAME_INSTANT_NS
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.receiver import listen, seen_by_all
+
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
+
+def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
+    """For each configuration how many intervals there are between fused lists issued while the log lasts, and the
+    seconds they cover.
+
+    Units that only some runs have are taken to be there.
+    """
+    world = replay.lists_only(experiment)
+    seen = seen_by_all(world, np.arange(1), states="true")
+    rates = {}
+    for name, configuration in world.experiment.configurations.items():
+        heard = listen(seen, world.truth, world.experiment, name)
+        issue_s = instants(heard, max_age_s=configuration.max_age_s).issue_s
+        issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= world.scene.end_s + _TOLERANCE_S)]
+        rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
+    return rates
