@@ -49,8 +49,9 @@ if TYPE_CHECKING:
     from copem_replay.fusion.testing.check import NonconformingError, check_fusion
     from copem_replay.io.recording import Recording
     from copem_replay.metrics.braking.driver import Driver, Reaction
-    from copem_replay.metrics.config import Measure, Onset
+    from copem_replay.metrics.config import Measure
     from copem_replay.metrics.gospa import gospa, ospa
+    from copem_replay.metrics.onset import Onset
     from copem_replay.metrics.survival import cumulative_incidence
     from copem_replay.perception.pem.detection import DetectionModel
     from copem_replay.perception.pem.error import ErrorModel
@@ -127,7 +128,8 @@ _PLACES = {
     "fusion.testing.check": "FUSION_RULES=RULES NonconformingError check_fusion",
     "io.recording": "Recording",
     "metrics.braking.driver": "Driver Reaction",
-    "metrics.config": "Measure Onset",
+    "metrics.config": "Measure",
+    "metrics.onset": "Onset",
     "metrics.gospa": "gospa ospa",
     "metrics.survival": "cumulative_incidence",
     "perception.pem.detection": "DetectionModel",

@@ -11,7 +11,8 @@ from typing import Any
 from copem_replay.core.text import unknown
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.file import Source
-from copem_replay.metrics.config import LONGEST_CHAIN
+from copem_replay.metrics.config import LONGEST_CHAIN, requires
+from copem_replay.metrics.onset import Requires
 
 NO_EGO = "none"
 """`ego: none`: no ego in this study."""
@@ -38,8 +39,9 @@ def references(source: Source) -> Iterator[str]:
         if _is_name(place) and place != "ego" and str(place) not in units:
             yield source.at(("measure", "distance_to"), unknown("unit", place, ["ego", *units]))
         onset = measure.get("onset")
-        if isinstance(onset, dict) and onset.get("kind") == "line_of_sight_any" and not _modelled(data):
-            yield source.at(("measure", "onset"), "line_of_sight_any: there is no unit to see anything")
+        kind = onset.get("kind") if isinstance(onset, dict) else None
+        if isinstance(kind, str) and requires(kind) is Requires.UNIT and not _modelled(data):
+            yield source.at(("measure", "onset"), f"{kind}: there is no unit to see anything")
     yield from _braking(source, data)
     yield from _carried(source, data)
     yield from _sweep(source, data, units)

@@ -173,8 +173,6 @@ _EXPECTED = {
     "too_short": "at least {min_length} in the list",
     "too_long": "at most {max_length} in the list",
     "literal_error": "{expected}",
-    "union_tag_invalid": "kind: one of {expected_tags}",
-    "union_tag_not_found": "{{kind: …}}",
 }
 
 
@@ -200,8 +198,7 @@ def _message(items: Sequence[Any], key: Key, data: Any) -> str:
     if first["type"] == "too_short" and isinstance(first["input"], Mapping):
         return "expected at least one, found none"
     words = dict.fromkeys(_EXPECTED[item["type"]].format(**item.get("ctx", {})) for item in items)
-    found = first["ctx"]["tag"] if first["type"] == "union_tag_invalid" else first["input"]
-    return f"expected {', or '.join(words)}, found {_short(found)}{_percent(first)}"
+    return f"expected {', or '.join(words)}, found {_short(first['input'])}{_percent(first)}"
 
 
 _DEVIATIONS = ("sigma_m", "sigma", "std_m", "std", "stddev_m", "stddev")

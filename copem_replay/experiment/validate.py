@@ -18,6 +18,7 @@ from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
+from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
 
 
@@ -160,14 +161,15 @@ def against_log(
                 yield ("units", f"{name}:{taken[0]}"), f"that is what {name} is called on object {taken[0]}"
         elif unit.on is not None and unit.on not in scene.object_number:
             yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
-    if experiment.measure.onset.kind != "line_of_sight" or known:
+    onset = experiment.measure.onset
+    if onset.requires is not Requires.UNIT_ON_EGO or known:
         return
     if not studied:
-        yield ("measure", "onset"), "line_of_sight is the ego's; without an ego use line_of_sight_any"
+        yield ("measure", "onset"), f"{onset.kind} is the ego's; without an ego use line_of_sight_any"
     elif not none:
         on_ego = ("ego", scene.object_ids[scene.ego_ix])
         if not any(unit.on in on_ego for unit in experiment.units.values()):
-            yield ("measure", "onset"), "line_of_sight needs a unit on the ego; or use line_of_sight_any"
+            yield ("measure", "onset"), f"{onset.kind} needs a unit on the ego; or use line_of_sight_any"
 
 
 def across_logs(experiment: Experiment, recordings: Sequence[Recording], source: Source | None) -> Iterator[str]:

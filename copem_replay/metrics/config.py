@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from typing import Annotated, Literal, Protocol, Self
 
 from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
-from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Share, Slot
+from copem_replay.core.components import Flag, Frozen, Id, Positive, Slot
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
+from copem_replay.metrics.onset import ONSETS, InRange, Onset, Requires
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import ClassNames
 
@@ -26,49 +28,22 @@ class Objects(Frozen):
         return self
 
 
-class StartsMoving(Frozen):
-    """The object moves, within a distance of the ego's centre, or ahead of its front along its heading."""
-
-    kind: Literal["starts_moving"]
-    speed_mps: Positive = 0.3
-    within_m: Positive | None = None
-    from_: Annotated[Literal["centre", "front"], Field(alias="from")] = "centre"
-
-
-class Appears(Frozen):
-    """The object is in the log."""
-
-    kind: Literal["appears"]
-
-
-class InRange(Frozen):
-    """The distance to the ego is within the range."""
-
-    kind: Literal["in_range"] = "in_range"
-    range_m: Positive = 50.0
-
-
-class LineOfSight(Frozen):
-    """The ego's units see at least this share of it (`line_of_sight`), or any unit does (`line_of_sight_any`)."""
-
-    kind: Literal["line_of_sight", "line_of_sight_any"]
-    visible_share: Annotated[Share, Field(gt=0)] = 0.1
-
-
-class At(Frozen):
-    """An instant of the log."""
-
-    kind: Literal["at"]
-    time_s: NotNegative
-
-
-Onset = Annotated[StartsMoving | Appears | InRange | LineOfSight | At, Field(discriminator="kind")]
-
-
 LONGEST_CHAIN = 12
 """More capture instants than this have no exact times (chosen: the chain has 2¹¹ states)."""
 
 Captures = Annotated[int, Field(strict=True, ge=1, le=1000)]
+
+
+_ONSET = Slot("onset", ONSETS)
+
+
+def requires(kind: str) -> Requires | None:
+    """What the onset of a kind needs of the experiment; None: there is no such onset."""
+    try:
+        onset = _ONSET.find(kind)
+    except PydanticCustomError:
+        return None
+    return onset.requires if issubclass(onset, Onset) else None
 
 
 class Confirm(Frozen):
@@ -122,7 +97,7 @@ class Measure(Frozen):
     """
 
     objects: Objects = Objects()
-    onset: Onset = InRange()
+    onset: Annotated[Onset, _ONSET] = InRange()
     count_earlier: Flag = False
     confirm: Confirm = Confirm()
     match: Match = Match()

@@ -23,7 +23,8 @@ from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import Verdicts, judge
 from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import ENDED_BY, Looks, Reference, reference_at
+from copem_replay.metrics.end_reason import texts_of
+from copem_replay.metrics.episodes import Looks, Reference, reference_at
 from copem_replay.perception.visibility import rectangles
 
 T = TypeVar("T", bound=np.generic)
@@ -97,7 +98,7 @@ def _columns(
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,
         "ended_s": flat(found.ended_s),
-        "ended_by": np.array(ENDED_BY, dtype=object)[flat(found.ended_by)],
+        "ended_by": texts_of(flat(found.ended_by)),
         "first_unit": names[flat(result.first_unit_ix)],
     }
     if known.foreseen_s is not None:

@@ -8,20 +8,21 @@ the last two are censoring. Source of the meanings: docs/measures.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import states_at, wrap
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, class_indices
-from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, Measure, MetricsSetup, StartsMoving
+from copem_replay.metrics.config import Measure, MetricsSetup
+from copem_replay.metrics.end_reason import END_REASONS, EndReason
+from copem_replay.metrics.onset import OnsetView, holds
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.sensor_poses import carrier, moved, observers, poses, unit_ground
 from copem_replay.perception.visibility import Statics, visible_shares
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
-_TOLERANCE_M = 1e-6
-ENDED_BY = ("object_left", "ego_left", "log_end")
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Looks:
     onset_s: Float
     onset_at_start: Bool
     ended_s: Float
-    ended_by: Int  # index into ENDED_BY
+    ended_by: Int  # index into END_REASONS
 
 
 def measured_objects(scene: Scene, measure: Measure) -> Int:
@@ -99,15 +100,20 @@ def looks(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup
     world = truth.take_tracks(wanted)
     ego_first_s, ego_last_s, ego_there = _ego_stay(scene, truth)
     first_s, last_s = world.row_captured_s[world.start[:-1]], world.row_captured_s[world.start[1:] - 1]
-    if isinstance(measure.onset, At):
-        onset_s = np.full(len(first_s), measure.onset.time_s)
+    instant_s = measure.onset.instant_s
+    if instant_s is not None:
+        onset_s = np.full(len(first_s), instant_s)
         found = (onset_s >= first_s - _TOLERANCE_S) & (onset_s <= last_s + _TOLERANCE_S)
         found &= (onset_s >= ego_first_s - _TOLERANCE_S) & (onset_s <= ego_last_s + _TOLERANCE_S)
         at_start = onset_s <= first_s + _TOLERANCE_S
     else:
         possible = ego_there[world.frame_ix]
-        holds = _condition(scene, truth, wanted, world, static, experiment) & possible
-        onset_row, found = _first_true(holds, world.start)
+        view = OnsetView(
+            world,
+            lambda of: _distance(scene, truth, world, experiment, of),
+            lambda of: _best_share(scene, truth, static, experiment, of)[wanted[truth.track_ix]],
+        )
+        onset_row, found = _first_true(holds(measure.onset, view) & possible, world.start)
         first_possible, _ = _first_true(possible, world.start)
         onset_s = world.row_captured_s[onset_row]
         # Held already when it could first be asked: at the object's first frame that the ego shares.
@@ -116,7 +122,9 @@ def looks(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup
     ended_s = np.minimum(np.minimum(last_s, ego_last_s), end_s)
     object_left = (last_s < end_s - _TOLERANCE_S) & (last_s <= ego_last_s + _TOLERANCE_S)
     ego_left = ~object_left & (ego_last_s < end_s - _TOLERANCE_S)
-    ended_by = np.where(object_left, 0, np.where(ego_left, 1, 2))
+    reasons = EndReason.OBJECT_LEFT, EndReason.EGO_LEFT, EndReason.LOG_END
+    left, ego, end = (END_REASONS.index(reason) for reason in reasons)
+    ended_by = np.where(object_left, left, np.where(ego_left, ego, end))
     order = np.flatnonzero(found)
     order = order[np.argsort(world.object_ix[order], kind="stable")]
     return Looks(world.object_ix[order], onset_s[order], at_start[order], ended_s[order], ended_by[order])
@@ -142,27 +150,6 @@ def _first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
     return np.where(found, first, start[:-1]), found
 
 
-def _condition(
-    scene: Scene, truth: Tracks, wanted: Bool, world: Tracks, static: Statics, experiment: MetricsSetup
-) -> Bool:
-    """(P,) where the onset's condition holds, row by row of `world`, the measured tracks of `truth`."""
-    onset = experiment.measure.onset
-    if isinstance(onset, Appears):
-        return np.ones(len(world.frame_ix), dtype=bool)
-    if isinstance(onset, LineOfSight):
-        shares = _best_share(scene, truth, static, experiment, ego_only=onset.kind == "line_of_sight")
-        seen: Bool = shares[wanted[truth.track_ix]] >= onset.visible_share - 1e-9
-        return seen
-    if isinstance(onset, StartsMoving):
-        moving: Bool = np.hypot(world.vx_mps[0], world.vy_mps[0]) >= onset.speed_mps - 1e-9
-        if onset.within_m is None:
-            return moving
-        return moving & (_distance(scene, truth, world, experiment, onset.from_) <= onset.within_m + _TOLERANCE_M)
-    if isinstance(onset, InRange):
-        return _distance(scene, truth, world, experiment, "centre") <= onset.range_m + _TOLERANCE_M
-    raise TypeError(f"onset {onset!r}")
-
-
 def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSetup, from_: str) -> Float:
     """(P,) distance of each row, infinite where there is nothing to measure from."""
     per_frame = reference_at(scene, truth, experiment, truth.captured_s)
@@ -176,7 +163,9 @@ def _distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSet
     return np.where(per_frame.present[f], distance, np.inf)
 
 
-def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup, *, ego_only: bool) -> Float:
+def _best_share(
+    scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup, of: Literal["ego", "any"]
+) -> Float:
     """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
 
     Units that only some runs have do not count: an onset is the same in all of them.
@@ -185,7 +174,7 @@ def _best_share(scene: Scene, truth: Tracks, static: Statics, experiment: Metric
     chosen = {
         name: unit
         for name, unit in experiment.units.items()
-        if not isinstance(unit.on, Carriers) and (not ego_only or unit.on in ego_carriers)
+        if not isinstance(unit.on, Carriers) and (of == "any" or unit.on in ego_carriers)
     }
     if not chosen:
         return np.zeros(len(truth.frame_ix))

@@ -15,6 +15,7 @@ from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import FIGURES, beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import Total
 from copem_replay.metrics.braking.driver import UNRESOLVED
+from copem_replay.metrics.end_reason import competes
 from copem_replay.metrics.fixed import NOTHING_DRAWN, Fixed
 from copem_replay.metrics.intervals import resamples, share_limits
 from copem_replay.metrics.survival import (
@@ -138,8 +139,7 @@ def _times(
     """Quantiles and mean of the time to detection, quantiles of the distance; rows count by `weight (n,)`."""
     if not len(part):
         return dict.fromkeys(_TIMES)
-    left = (part["ended_by"] == "object_left").to_numpy()
-    ending = np.where(detected, DETECTED, np.where(left, LEFT, CENSORED))
+    ending = np.where(detected, DETECTED, np.where(competes(part["ended_by"]), LEFT, CENSORED))
     looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
     # To a nanosecond: of equal times detections come first, and 1 − 0.8 is less than 0.2 − 0.
     time_s = np.round(np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), looked_s), 9)

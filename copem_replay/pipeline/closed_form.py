@@ -23,7 +23,7 @@ from copem_replay.metrics.braking.driver import Reaction
 from copem_replay.metrics.braking.verdict import fail_probability, pass_probability
 from copem_replay.metrics.detection.by_truth_id import capture_instants
 from copem_replay.metrics.detections_table import distances
-from copem_replay.metrics.episodes import ENDED_BY
+from copem_replay.metrics.end_reason import texts_of
 from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
 from copem_replay.pipeline.expansion import fleet_of
 from copem_replay.pipeline.prepare import Replay
@@ -168,7 +168,7 @@ def _columns(replay: Replay, experiment: Experiment, name: str, distributions: l
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,
         "ended_s": looks.ended_s[look],
-        "ended_by": np.array(ENDED_BY, dtype=object)[looks.ended_by[look]],
+        "ended_by": texts_of(looks.ended_by[look]),
     }
 
 

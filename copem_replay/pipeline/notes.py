@@ -13,7 +13,6 @@ from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks
 from copem_replay.core.view_geometry import Look
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.config import At
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
@@ -167,8 +166,8 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
         wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
         beside = " beside the ego" if scene.ego_ix >= 0 else ""
         yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}"
-    elif isinstance(measure.onset, At) and measure.onset.time_s > scene.end_s:
-        yield f"no rows: the onset at {measure.onset.time_s:g} s lies after the log's end, {scene.end_s:g} s"
+    elif (instant_s := measure.onset.instant_s) is not None and instant_s > scene.end_s:
+        yield f"no rows: the onset at {instant_s:g} s lies after the log's end, {scene.end_s:g} s"
     elif not len(looks.object_ix):
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
     if experiment.braking is not None and len(looks.object_ix) and not replay.encounters:

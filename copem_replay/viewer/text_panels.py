@@ -10,14 +10,9 @@ import pandas as pd
 
 from copem_replay.core.tracks import Scene
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.end_reason import EndReason
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import Out, ns, part_of, short_ids
-
-_ENDINGS = {
-    "object_left": "left undetected",
-    "ego_left": "undetected when the ego left",
-    "log_end": "undetected when the log ended",
-}
 
 
 def onsets(out: Out, scene: Scene, table: pd.DataFrame) -> None:
@@ -51,7 +46,9 @@ def _ending(look: Any, scene: Scene) -> tuple[float, str, str]:
     who, verdict = _who(look, scene), verdict_of(look)
     then = f"; the ego {verdict}" if verdict else ""
     if not look.detected:
-        return look.ended_s, "WARN", f"{who} {_ENDINGS[look.ended_by]}{then}"
+        why = EndReason(look.ended_by)
+        ending = f"undetected when {why.past}" if why.censors else "left undetected"
+        return look.ended_s, "WARN", f"{who} {ending}{then}"
     late_s, far_m = look.time_to_detection_s, look.distance_at_detection_m
     when = f"{abs(late_s):.2f} s {'before' if late_s < 0 else 'after'} the onset"
     where = "" if np.isnan(far_m) else f", at {far_m:.1f} m"

@@ -332,7 +332,7 @@ KEYS = (
 )
 CLASSES = "pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, vehicle, vru, vehicles"
 FUSIONS = "ideal, union, nms, gnn, tracker"
-ONSETS = "'starts_moving', 'appears', 'in_range', 'line_of_sight', 'line_of_sight_any', 'at'"
+ONSETS = "starts_moving, appears, in_range, line_of_sight, line_of_sight_any, at"
 KINDS = "expected {kind: …}, kind one of visible_share, constant, table; found "
 CORNERS = "expected the corners in order around an area, each once"
 IN_PLANE = "expected two numbers, in the plane"
@@ -537,9 +537,9 @@ CASES = [
     (TOP, "measure: []", "17: measure: expected keys and values, found []"),
     (MEASURE, "objects: {classes: [car], ids: [1]}", ".objects: expected either classes or ids, found both"),
     (MEASURE, "objects: {ids: []}", ".objects.ids: expected at least 1 in the list, found []"),
-    (MEASURE, "onset: in_range", ".onset: expected keys and values, found 'in_range'"),
-    (MEASURE, "onset: {}", ".onset: expected {kind: …}, found {}"),
-    (MEASURE, "onset: {kind: soon}", f".onset: expected kind: one of {ONSETS}, found 'soon'"),
+    (MEASURE, "onset: in_range", f".onset: expected {{kind: …}}, kind one of {ONSETS}; found 'in_range'"),
+    (MEASURE, "onset: {}", f".onset: expected {{kind: …}}, kind one of {ONSETS}; found {{}}"),
+    (MEASURE, "onset: {kind: soon}", f".onset: kind: expected one of {ONSETS}, or package.module:Class; found 'soon'"),
     (MEASURE, "onset: {kind: at}", ".onset.time_s: missing"),
     (MEASURE, "onset: {kind: in_range, range: 5}", ".onset.range: unknown key; did you mean range_m?"),
     (MEASURE, "onset: {kind: at, time_s: 1, colour: 5}", ".onset.colour: unknown key; known here: kind, time_s"),

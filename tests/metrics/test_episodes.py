@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import distances
-from copem_replay.metrics.episodes import ENDED_BY, looks
+from copem_replay.metrics.end_reason import END_REASONS, competes, texts_of
+from copem_replay.metrics.episodes import looks
 from copem_replay.perception.visibility import NO_STATICS
 from tests.helpers import scenes
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -20,9 +22,9 @@ def looked(log: Recording, **changes: object) -> dict[str, tuple[float, bool, fl
     """Onset, whether it held from the first, end and why, of each object."""
     found = looks(log.scene, log.truth, NO_STATICS, experiment(**changes))
     return {
-        log.scene.object_ids[k]: (float(onset_s), bool(at_start), float(ended_s), ENDED_BY[why])
+        log.scene.object_ids[k]: (float(onset_s), bool(at_start), float(ended_s), str(why))
         for k, onset_s, at_start, ended_s, why in zip(
-            found.object_ix, found.onset_s, found.onset_at_start, found.ended_s, found.ended_by, strict=True
+            found.object_ix, found.onset_s, found.onset_at_start, found.ended_s, texts_of(found.ended_by), strict=True
         )
     }
 
@@ -75,6 +77,16 @@ def test_what_is_wholly_visible_reaches_a_share_of_one(share: float, expected_s:
     onset = {"onset": {"kind": "line_of_sight", "visible_share": share}}
     found = looked(scenes.behind_a_wall(), measure=onset, visibility="flat", pems={"sure": scenes.SEES_ALL})
     assert found["walker"][:2] == (pytest.approx(expected_s), False)
+
+
+def test_only_an_object_that_leaves_is_never_detected() -> None:
+    """The ends of the ego and of the log censor; positions are those of the texts, in any shape."""
+    assert competes(pd.Series(["log_end", "object_left", "ego_left"])).tolist() == [False, True, False]
+    assert competes(pd.Series([], dtype=object)).tolist() == []
+    assert {reason.value: reason.censors for reason in END_REASONS} == {
+        "object_left": False, "ego_left": True, "log_end": True,
+    }  # fmt: skip
+    assert texts_of(np.array([2, 0, 1, 0])).tolist() == ["log_end", "object_left", "ego_left", "object_left"]
 
 
 def without_a_size(distance_to: str) -> tuple[Recording, Experiment]:

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.tracks import Float, Int
+from copem_replay.metrics.end_reason import competes
 from copem_replay.metrics.fixed import NOTHING_DRAWN, fixed_in
 from copem_replay.metrics.summary import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
@@ -72,10 +73,9 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
 def endings(rows: pd.DataFrame) -> tuple[Float, Int]:
     """Time (n,) from the onset to the detection or to the end of the look, and how the look ended (n,)."""
     detected = rows["time_to_detection_s"].notna().to_numpy()
-    left = (rows["ended_by"] == "object_left").to_numpy()
     looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
-    return time_s, np.where(detected, DETECTED, np.where(left, LEFT, CENSORED))
+    return time_s, np.where(detected, DETECTED, np.where(competes(rows["ended_by"]), LEFT, CENSORED))
 
 
 def curves_of(results: Results, names: Sequence[str], *, bands: bool = True) -> tuple[str | None, dict[str, Curve]]:

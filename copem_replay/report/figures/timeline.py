@@ -16,13 +16,12 @@ from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Driver
 from copem_replay.metrics.braking.encounter import Encounter
-from copem_replay.metrics.config import InRange, LineOfSight, StartsMoving
+from copem_replay.metrics.end_reason import EndReason
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.report.figures.trajectories import Course, braked_course, recorded_course
 
 _STOOD_MPS = 0.05
 """Slower than this the ego has stopped (chosen)."""
-_ENDINGS = {"object_left": "object leaves", "ego_left": "ego leaves", "log_end": "log ends"}
 _LOOK_S = 0.05
 """Between instants at which the nearest approach of what is in no conflict is sought (chosen)."""
 
@@ -64,7 +63,7 @@ def story(replay: Replay, experiment: Experiment, row: Any) -> Story:
     object_ix = replay.scene.object_number[row.object_id]
     braking = experiment.braking
     encounter = next((e for e in replay.encounters if replay.looks.object_ix[e.look_ix] == object_ix), None)
-    told = [(row.onset_s, "onset", _onset(experiment, CLASSES[replay.scene.object_class[object_ix]]))]
+    told = [(row.onset_s, "onset", experiment.measure.onset.label(CLASSES[replay.scene.object_class[object_ix]]))]
     result = "never known"
     if row.detected:
         told += [(row.captured_s, "captured", "captured"), (row.detection_s, "arrives", "list arrives")]
@@ -81,7 +80,7 @@ def story(replay: Replay, experiment: Experiment, row: Any) -> Story:
         result += ", passes" if row.braking_pass else ", fails"
     else:
         told += _nearest(replay, experiment.max_gap_s, object_ix, row)
-        told += [] if row.detected else [(row.ended_s, "ended", _ENDINGS[row.ended_by])]
+        told += [] if row.detected else [(row.ended_s, "ended", EndReason(row.ended_by).label)]
         result += ", no conflict" if braking is not None else ""
     told.sort(key=lambda event: (event[0], KINDS.index(event[1])))
     events = tuple(Event(float(time_s - row.onset_s), kind, label) for time_s, kind, label in told)
@@ -94,17 +93,6 @@ def _or_never(time_s: float) -> float:
 
 def _number(value: float) -> str:
     return f"{value:.2f}".rstrip("0").rstrip(".").replace("-", "−")
-
-
-def _onset(experiment: Experiment, object_class: str) -> str:
-    onset = experiment.measure.onset
-    if isinstance(onset, StartsMoving):
-        return "walking starts" if object_class == "pedestrian" else "starts to move"
-    if isinstance(onset, InRange):
-        return f"within {onset.range_m:g} m"
-    if isinstance(onset, LineOfSight):
-        return "in sight"
-    return {"appears": "appears", "at": "clock starts"}[onset.kind]
 
 
 def _outcome(encounter: Encounter, driver: Driver, margin_m: float, row: Any, brake_s: float) -> tuple[float, str]:

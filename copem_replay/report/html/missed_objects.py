@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.text import counted
+from copem_replay.metrics.end_reason import EndReason
 from copem_replay.metrics.summary_text import cell
 from copem_replay.report.html.markup import Html, joined, listed, table, tag
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 _OPEN = 40
 """Rows up to which the table is shown at once (chosen)."""
-_ENDINGS = {"object_left": "it left", "ego_left": "the ego left", "log_end": "the log ended"}
 
 
 def never_detected(study: Study) -> Html:
@@ -115,5 +115,5 @@ def _row(study: Study, found: pd.Series, names: list[str]) -> Html:
             data_value=str(found["missed"])),
         tag("td", by, class_="text long"),
         tag("td", cell(float(found["ended_s"] - found["onset_s"]))),
-        tag("td", _ENDINGS.get(str(found["ended_by"]), str(found["ended_by"])), class_="text"),
+        tag("td", EndReason(found["ended_by"]).past, class_="text"),
     )  # fmt: skip

@@ -9,7 +9,6 @@ from copem_replay.core.components import Component
 from copem_replay.core.text import counted
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.io.window import in_words
-from copem_replay.metrics.config import Appears, At, InRange, LineOfSight, StartsMoving
 from copem_replay.report.html.markup import Html, table, tag
 from copem_replay.report.html.tables import named
 
@@ -75,22 +74,8 @@ def setting(study: Study) -> str:
 
 
 def _onset(experiment: Experiment) -> str:
-    onset, near = experiment.measure.onset, experiment.measure.distance_to
-    whom = "the ego" if near == "ego" else f"unit {near}"
-    if isinstance(onset, StartsMoving):
-        within = ""
-        if onset.within_m is not None:
-            within = f" within {onset.within_m:g} m of {whom}{'’s front' if onset.from_ == 'front' else ''}"
-        return f"when it moves at {onset.speed_mps:g} m/s or more{within}"
-    if isinstance(onset, InRange):
-        return f"when it comes within {onset.range_m:g} m of {whom}"
-    if isinstance(onset, LineOfSight):
-        by = "a unit of the ego" if onset.kind == "line_of_sight" else "any unit"
-        return f"when {by} sees {100 * onset.visible_share:g} % of it"
-    if isinstance(onset, At):
-        return f"{onset.time_s:g} s after the log’s start"
-    assert isinstance(onset, Appears)
-    return "when it appears in the log"
+    near = experiment.measure.distance_to
+    return experiment.measure.onset.described("the ego" if near == "ego" else f"unit {near}")
 
 
 def configurations(study: Study) -> Html:

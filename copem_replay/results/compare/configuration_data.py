@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.metrics.end_reason import COMPETES
 from copem_replay.results.compare.labels import Named
 from copem_replay.results.compare.pairing import Grid, flag, lists, number, whole
 
@@ -121,9 +122,10 @@ def _laid(values: NDArray[T], cell: Int, size: int) -> NDArray[T]:
 
 
 def _is_left(rows: pa.Table) -> Bool:
+    import pyarrow as pa
     import pyarrow.compute as pc
 
-    return flag(pc.equal(rows["ended_by"], "object_left"))
+    return flag(pc.is_in(rows["ended_by"], pa.array(COMPETES)))
 
 
 def _check_once(place: Path, cell: Int, configuration: str) -> None:

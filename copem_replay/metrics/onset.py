@@ -1,0 +1,236 @@
+"""Onsets: the condition that starts the clock of a measured object, as components.
+
+An own onset derives from `Onset` and answers `holds`; the experiment names it with `kind: package.module:Class`. The
+meanings of the built-in ones: docs/measures.md.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from copem_replay.core.components import Component, NotNegative, Positive, Share, asked, wrong
+from copem_replay.core.tracks import Bool, Float, Tracks
+
+_TOLERANCE_M = 1e-6
+
+
+class Requires(Enum):
+    """What an onset needs of the experiment beside the truth."""
+
+    NOTHING = "nothing"
+    UNIT = "a modelled unit"
+    UNIT_ON_EGO = "a unit on the ego"
+
+
+@dataclass(frozen=True)
+class OnsetView:
+    """What an onset's condition reads. Rows P: each measured object at the truth's own frames, object after object.
+
+    `tracks`: the states, one object a track. `distance_m("centre" | "front") (P,)`: metres to the place that
+    `measure.distance_to` names, from its centre or along its heading from its front; infinite where it is absent.
+    `visible_share("ego" | "any") (P,)`: the largest share, 0 … 1, that any unit (of the ego) sees.
+    """
+
+    tracks: Tracks
+    distance_m: Callable[[Literal["centre", "front"]], Float]
+    visible_share: Callable[[Literal["ego", "any"]], Float]
+
+    @property
+    def time_s(self) -> Float:
+        """(P,) seconds since the log's start."""
+        return self.tracks.row_captured_s
+
+    @property
+    def speed_mps(self) -> Float:
+        """(P,) speed over ground."""
+        speed: Float = np.hypot(self.tracks.vx_mps[0], self.tracks.vy_mps[0])
+        return speed
+
+
+class Onset(Component, ABC):
+    """Base of onsets. The onset of an object is the first frame, with the ego in the log, at which `holds`."""
+
+    requires: ClassVar[Requires] = Requires.NOTHING
+    """What the experiment needs for this onset; `check` says where it lacks. A property of the class, no field."""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **given: Any) -> None:
+        super().__pydantic_init_subclass__(**given)
+        if "requires" in cls.model_fields or not isinstance(cls.requires, Requires):
+            raise TypeError("requires: expected a property of the class, `requires: ClassVar[Requires]`")
+
+    @property
+    def instant_s(self) -> float | None:
+        """Seconds since the log's start where the onset is an instant, which may lie between two frames; else None."""
+        return None
+
+    @abstractmethod
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) whether the condition holds, row by row. May not draw random numbers."""
+
+    def label(self, object_class: str) -> str:
+        """Two or three words for figures, such as `starts to move`, of an object of a class."""
+        return self.kind.rpartition(":")[2]
+
+    def described(self, near: str) -> str:
+        """When the clock of an object starts, for the report. `near`: the place that distances are measured from."""
+        return f"at its onset “{self.label('object')}”"
+
+
+def holds(onset: Onset, view: OnsetView) -> Bool:
+    """(P,) where an onset's condition holds, checked. Raises InputError when an own onset fails."""
+    where = "measure.onset"
+    found = asked(onset, where, lambda: np.asarray(onset.holds(view)))
+    expected = view.time_s.shape
+    if found.shape != expected or found.dtype != np.bool_:
+        said = f"{found.dtype} {found.shape}"
+        raise wrong(onset, where, f"holds(view): expected true or false of shape {expected}, found {said}", "holds")
+    return found
+
+
+class StartsMoving(Onset):
+    """The object moves, within a distance of the ego's centre, or ahead of its front along its heading."""
+
+    kind: Literal["starts_moving"] = "starts_moving"
+    speed_mps: Positive = 0.3
+    within_m: Positive | None = None
+    from_: Annotated[Literal["centre", "front"], Field(alias="from")] = "centre"
+
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) whether the speed is reached, near enough."""
+        moving: Bool = view.speed_mps >= self.speed_mps - 1e-9
+        if self.within_m is None:
+            return moving
+        return moving & (view.distance_m(self.from_) <= self.within_m + _TOLERANCE_M)
+
+    def label(self, object_class: str) -> str:
+        """A pedestrian walks."""
+        return "walking starts" if object_class == "pedestrian" else "starts to move"
+
+    def described(self, near: str) -> str:
+        """The speed, and how near."""
+        within = ""
+        if self.within_m is not None:
+            within = f" within {self.within_m:g} m of {near}{'’s front' if self.from_ == 'front' else ''}"
+        return f"when it moves at {self.speed_mps:g} m/s or more{within}"
+
+
+class Appears(Onset):
+    """The object is in the log."""
+
+    kind: Literal["appears"] = "appears"
+
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) always."""
+        return np.ones(len(view.time_s), dtype=bool)
+
+    def label(self, object_class: str) -> str:
+        """Says it appears."""
+        return "appears"
+
+    def described(self, near: str) -> str:
+        """Says it appears."""
+        return "when it appears in the log"
+
+
+class InRange(Onset):
+    """The distance to the ego is within the range."""
+
+    kind: Literal["in_range"] = "in_range"
+    range_m: Positive = 50.0
+
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) whether the centre is near enough."""
+        return view.distance_m("centre") <= self.range_m + _TOLERANCE_M
+
+    def label(self, object_class: str) -> str:
+        """The range."""
+        return f"within {self.range_m:g} m"
+
+    def described(self, near: str) -> str:
+        """The range, and of what."""
+        return f"when it comes within {self.range_m:g} m of {near}"
+
+
+class LineOfSightAny(Onset):
+    """Any unit sees at least this share of the object. Units that only some runs have do not count."""
+
+    kind: Literal["line_of_sight_any"] = "line_of_sight_any"
+    visible_share: Annotated[Share, Field(gt=0)] = 0.1
+
+    requires: ClassVar[Requires] = Requires.UNIT
+
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) whether enough is seen."""
+        return view.visible_share("any") >= self.visible_share - 1e-9
+
+    def label(self, object_class: str) -> str:
+        """Says it is in sight."""
+        return "in sight"
+
+    def described(self, near: str) -> str:
+        """How much is seen."""
+        return f"when any unit sees {100 * self.visible_share:g} % of it"
+
+
+class LineOfSight(Onset):
+    """The ego's units see at least this share of the object."""
+
+    kind: Literal["line_of_sight"] = "line_of_sight"
+    visible_share: Annotated[Share, Field(gt=0)] = 0.1
+
+    requires: ClassVar[Requires] = Requires.UNIT_ON_EGO
+
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) whether enough is seen."""
+        return view.visible_share("ego") >= self.visible_share - 1e-9
+
+    def label(self, object_class: str) -> str:
+        """Says it is in sight."""
+        return "in sight"
+
+    def described(self, near: str) -> str:
+        """How much is seen."""
+        return f"when a unit of the ego sees {100 * self.visible_share:g} % of it"
+
+
+class At(Onset):
+    """An instant of the log, the same for all objects that are then in it."""
+
+    kind: Literal["at"] = "at"
+    time_s: NotNegative
+
+    @property
+    def instant_s(self) -> float:
+        """That instant."""
+        return self.time_s
+
+    def holds(self, view: OnsetView) -> Bool:
+        """(P,) from then on."""
+        return view.time_s >= self.time_s
+
+    def label(self, object_class: str) -> str:
+        """Says the clock starts."""
+        return "clock starts"
+
+    def described(self, near: str) -> str:
+        """The instant."""
+        return f"{self.time_s:g} s after the log’s start"
+
+
+ONSETS = {
+    "starts_moving": "copem_replay.metrics.onset:StartsMoving",
+    "appears": "copem_replay.metrics.onset:Appears",
+    "in_range": "copem_replay.metrics.onset:InRange",
+    "line_of_sight": "copem_replay.metrics.onset:LineOfSight",
+    "line_of_sight_any": "copem_replay.metrics.onset:LineOfSightAny",
+    "at": "copem_replay.metrics.onset:At",
+}
+"""Built-in names of `measure: {onset: {kind: …}}`."""
