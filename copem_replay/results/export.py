@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.selected_runs import OneRun, ShownRun
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from copem_replay.pipeline.selected_runs import OneRun, ShownRun
 
 
 @dataclass(frozen=True)
