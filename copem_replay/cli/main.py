@@ -69,15 +69,17 @@ def info(
     """
     import json
 
-    from copem_replay.experiment.draft.survey import describe, survey
+    from copem_replay.experiment.draft.findings import as_json as plain
+    from copem_replay.experiment.draft.survey import survey
+    from copem_replay.experiment.draft.survey_text import describe
 
     surveys = [survey(log) for log in logs]
     if as_json:
-        print(json.dumps(surveys, indent=1, ensure_ascii=False))
+        print(json.dumps([plain(s) for s in surveys], indent=1, ensure_ascii=False))
     else:
-        _print_blocks(describe(s) for s in surveys if s["topics"])
-    _complain(s["reason"] for s in surveys if not s["readable"])
-    return 0 if any(s["readable"] for s in surveys) else 2
+        _print_blocks(describe(s) for s in surveys if s.topics)
+    _complain(s.reason for s in surveys if s.reason is not None)
+    return 0 if any(s.readable for s in surveys) else 2
 
 
 @app.command()
@@ -91,10 +93,10 @@ def init(log: Annotated[Path, typer.Argument(metavar="LOG", help="Recording: MCA
     from copem_replay.experiment.draft.template import commented, proposed, unfinished
 
     found = survey(log)
-    text = commented(found) if found["readable"] else proposed(found)
+    text = commented(found) if found.readable else proposed(found)
     if text is None:
         print(unfinished(found), end="")
-        raise InputError(found["reason"])
+        raise InputError(found.reason or f"{log}: no list of true objects")
     try:
         str(log).encode()
     except UnicodeEncodeError:
