@@ -183,7 +183,8 @@ def _ego(recording: Recording) -> EgoFound | None:
     scene, truth = recording.scene, recording.truth
     if scene.ego_ix < 0:
         return None
-    first, last = (int(truth.start[scene.ego_ix + k]) - k for k in (0, 1))
+    first = int(truth.start[scene.ego_ix])  # the track of an object has its number
+    last = int(truth.start[scene.ego_ix + 1]) - 1
     return EgoFound(
         id=scene.object_ids[scene.ego_ix],
         class_=CLASSES[scene.object_class[scene.ego_ix]],
