@@ -227,11 +227,13 @@ def _columns(
         columns = _decode(log, topic)
         if asked is None:
             return columns, None, ""
-        from copem_replay.io.world_frame import surroundings, with_ego
+        from copem_replay.io.ego_pose import with_ego
+        from copem_replay.io.world_frame import surroundings
 
         around = surroundings(log, asked, seek_ego=False)
-        return _with_notes(with_ego(columns, around), around), around, ""
-    from copem_replay.io.world_frame import in_world, lists_of, surroundings, with_ego
+        return _with_notes(with_ego(columns, around.ego, around.asked), around), around, ""
+    from copem_replay.io.ego_pose import with_ego
+    from copem_replay.io.world_frame import in_world, lists_of, surroundings
 
     around = surroundings(log, asked, seek_ego=seek_ego)
     mine = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
@@ -242,7 +244,7 @@ def _columns(
         )
     world = around.world_of(found)
     found = in_world(found, around, log.path, topic)
-    return _with_notes(with_ego(found.columns, around), around), around, world
+    return _with_notes(with_ego(found.columns, around.ego, around.asked), around), around, world
 
 
 def _with_notes(columns: Columns, around: Surroundings) -> Columns:

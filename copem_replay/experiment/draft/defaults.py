@@ -75,8 +75,8 @@ def _poses(log: Log) -> list[dict[str, str]]:
     if not foreign(log):
         return []
     from copem_replay.io.encodings.raw_values import DefinitionError
+    from copem_replay.io.messages import gathered
     from copem_replay.io.schemas.poses import poses_of
-    from copem_replay.io.world_frame import gathered
 
     found: list[tuple[int, dict[str, str]]] = []
     for channel in foreign(log):
