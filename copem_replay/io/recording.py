@@ -73,7 +73,7 @@ def read(
 
     `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
     odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
-    have what, None where that is known. `beside`: topics that somebody else reads.
+    have what, None where that is known. `beside`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
     on the topic of the truth was logged; None: from the beginning, to the end.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,

@@ -48,7 +48,7 @@ class Surroundings:
         return self.ego.parent if self.ego is not None else self.frames.world_of(frame)
 
     def world_of(self, found: Listed) -> str:
-        """The frame that lists are brought into, "" where nobody names one."""
+        """The frame that lists are brought into, "" where no list names one."""
         said = found.frame_code[found.frame_code >= 0]
         return self.world_for(found.frames[said[0]].lstrip("/") if len(said) else "")
 

@@ -1,4 +1,4 @@
-"""What an experiment on a recording could be: whose eyes, who is measured, where a mast would stand.
+"""What an experiment on a recording could be: the ego, the measured objects, the place of a mast.
 
 Guesses from what is in the log, to begin with; each says why.
 """
@@ -25,7 +25,7 @@ RANGE_M = 50.0
 MAST_M = 10.0
 """So far from the busiest place the mast stands (chosen: beside the lane, not on it)."""
 _CELL_M = 10.0  # the busiest place is sought on a grid (chosen)
-_MOVED_M = 10.0  # who came less far is parked or a pedestrian's width away from it (chosen)
+_MOVED_M = 10.0  # an object that moved less is parked, or nearly (chosen)
 _MOSTLY = 0.75  # the share of a log that an ego is there (chosen: what records a log is there from beginning to end)
 _ROWS = 100_000  # object states looked at for a place of the mast (chosen: a sample says it as well)
 _DRIVEN = ("car", "van", "truck", "bus", "vehicle", "motorcycle")
