@@ -38,7 +38,9 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
     It is surveyed and read; `looked` is called then, and its other lists are read and its messages copied.
     """
     from copem_replay.core.errors import InputError, RecordingError
-    from copem_replay.experiment.draft.survey import describe, survey
+    from copem_replay.experiment.draft.findings import as_json
+    from copem_replay.experiment.draft.survey import survey
+    from copem_replay.experiment.draft.survey_text import describe
     from copem_replay.io import recorded_lists as unit_lists
     from copem_replay.io import recorded_osi as lists
     from copem_replay.io.open import open_log
@@ -51,8 +53,8 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
         warnings.simplefilter("error")
         try:
             found = survey(path)
-            json.dumps(found, allow_nan=False)
-            said += [*describe(found), *([found["reason"]] if found["reason"] else [])]
+            json.dumps(as_json(found), allow_nan=False)
+            said += [*describe(found), *([found.reason] if found.reason else [])]
             try:
                 recording = read(path, name="log")
                 said += recording.notes
@@ -62,7 +64,7 @@ def outcome(path: Path, looked: Callable[[], None] = lambda: None) -> dict[str, 
                 end = REFUSED
                 recording = None
             looked()
-            if (end == READ) > found["readable"]:
+            if (end == READ) > found.readable:
                 return {"outcome": "defect", "what": "read, but the survey says it cannot be"}
             if recording is not None:
                 for topic in {c.topic: c.schema for c in open_log(path).channels if c.messages}.items():

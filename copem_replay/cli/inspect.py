@@ -27,16 +27,17 @@ def info(
 
     The exit code is 0 when at least one object list is readable, else 2.
     """
-    from copem_replay.cli.api.recordings import inspect_recording
-    from copem_replay.experiment.draft.survey import describe
+    from copem_replay.experiment.draft.findings import as_json as plain
+    from copem_replay.experiment.draft.survey import survey
+    from copem_replay.experiment.draft.survey_text import describe
 
-    surveys = [inspect_recording(log) for log in logs]
+    surveys = [survey(log) for log in logs]
     if as_json:
-        print(json.dumps(surveys, indent=1, ensure_ascii=False))
+        print(json.dumps([plain(s) for s in surveys], indent=1, ensure_ascii=False))
     else:
-        say_blocks(describe(s) for s in surveys if s["topics"])
-    complain(s["reason"] for s in surveys if not s["readable"])
-    return 0 if any(s["readable"] for s in surveys) else 2
+        say_blocks(describe(s) for s in surveys if s.topics)
+    complain(s.reason for s in surveys if s.reason is not None)
+    return 0 if any(s.readable for s in surveys) else 2
 
 
 def init(log: LogFile) -> int:
@@ -51,7 +52,7 @@ def init(log: LogFile) -> int:
     text, found = draft_of(log)
     if text is None:
         print(unfinished(found), end="")
-        raise InputError(found["reason"])
+        raise InputError(found.reason or f"{log}: no list of true objects")
     encodable(log)
     print(text, end="")
     return 0

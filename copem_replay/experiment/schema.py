@@ -1,6 +1,6 @@
 """The experiment: what is replayed through what, and what is measured. Frozen models, defaults that run.
 
-Key names are the contract's; units are in the names. Cross-references (a unit's `pem`, a configuration's `units`)
+Units are in the names of keys. Cross-references (a unit's `pem`, a configuration's `units`)
 are checked in `experiment/validate.py`, which reports all problems of a file at once.
 """
 

@@ -103,7 +103,7 @@ class Log:
             for message in in_order(file, summary, spans):
                 found += 1
                 yield message
-            if found != promised and self.window is None:  # of a window nobody says how many there are
+            if found != promised and self.window is None:  # the index does not count a window's messages
                 raise ValueError(f"the index promises {promised} messages, and there are {found}")
         except DAMAGE as error:
             raise BrokenIndexError(self.path) from without_trace(error)

@@ -11,7 +11,7 @@ import numpy as np
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int
 
-MAX_GAP_S = 0.5  # no difference is taken across a longer gap (the contract's `max_gap_s`)
+MAX_GAP_S = 0.5  # no difference is taken across a longer gap (the default of an experiment's `max_gap_s`)
 MOVING_MPS = 0.5  # what is faster by its positions cannot stand still (chosen)
 FASTEST_MPS = 100.0  # what is faster is no speed (chosen)
 

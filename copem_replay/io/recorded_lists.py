@@ -20,13 +20,14 @@ from copem_replay.io.encodings.columns import take_apart
 from copem_replay.io.encodings.definition import definition_of
 from copem_replay.io.encodings.raw_values import DefinitionError
 from copem_replay.io.log import BrokenIndexError, Log
+from copem_replay.io.messages import gathered
 from copem_replay.io.open import open_log
 from copem_replay.io.recorded_osi import RecordedLists, as_tracks
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.object_lists import Listed
 from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.window import Window
-from copem_replay.io.world_frame import Surroundings, gathered, in_world, lists_of, surroundings
+from copem_replay.io.world_frame import Surroundings, in_world, lists_of, surroundings
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write.ros2_definitions import STRING
 

@@ -77,7 +77,7 @@ def read(
 
     `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
     odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
-    have what, None where that is known. `beside`: topics that somebody else reads.
+    have what, None where that is known. `beside`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
     on the topic of the truth was logged; None: from the beginning, to the end.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
@@ -231,11 +231,13 @@ def _columns(
         columns = _decode(log, topic)
         if asked is None:
             return columns, None, ""
-        from copem_replay.io.world_frame import surroundings, with_ego
+        from copem_replay.io.ego_pose import with_ego
+        from copem_replay.io.world_frame import surroundings
 
         around = surroundings(log, asked, seek_ego=False)
-        return _with_notes(with_ego(columns, around), around), around, ""
-    from copem_replay.io.world_frame import in_world, lists_of, surroundings, with_ego
+        return _with_notes(with_ego(columns, around.ego, around.asked), around), around, ""
+    from copem_replay.io.ego_pose import with_ego
+    from copem_replay.io.world_frame import in_world, lists_of, surroundings
 
     around = surroundings(log, asked, seek_ego=seek_ego)
     mine = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
@@ -246,7 +248,7 @@ def _columns(
         )
     world = around.world_of(found)
     found = in_world(found, around, log.path, topic)
-    return _with_notes(with_ego(found.columns, around), around), around, world
+    return _with_notes(with_ego(found.columns, around.ego, around.asked), around), around, world
 
 
 def _with_notes(columns: Columns, around: Surroundings) -> Columns:

@@ -201,9 +201,9 @@ def test_what_is_missing_is_said(tmp_path: Path, call: Call) -> None:  # noqa: F
     assert lines[0] == "# /my/things (my.Things) may be a list of objects:"
     assert "#   # width_m: …   # needed, and not found: a path, or a number that goes for all" in lines
     assert all(line.startswith("#") for line in lines)
-    (proposal,) = survey(tmp_path / "log.mcap")["proposals"]
-    assert (proposal["missing"], proposal["truth"]) == (["width_m"], None)
-    assert "things[].length" in proposal["offers"]
+    (proposal,) = survey(tmp_path / "log.mcap").proposals
+    assert (proposal.missing, proposal.truth) == (["width_m"], None)
+    assert "things[].length" in proposal.offers
 
 
 def test_fields_that_do_not_read(tmp_path: Path, call: Call) -> None:  # noqa: F811

@@ -16,6 +16,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 
 from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
+from copem_replay.experiment.draft.findings import Mast
 from copem_replay.experiment.draft.survey import survey
 from copem_replay.experiment.draft.template import commented, quoted, short
 from tests.helpers.experiments import drive
@@ -55,7 +56,7 @@ def replayed(call: Call, tmp_path: Path) -> Callable[[str | Path], dict[str, Any
     def through(log: str | Path) -> dict[str, Any]:
         made = call("init", log)
         assert (made.code, made.err) == (0, [])
-        experiments = {"long": made.out, "short": survey(log)["experiment"]}
+        experiments = {"long": made.out, "short": survey(log).experiment}
         for name, text in experiments.items():
             (tmp_path / f"{name}.yaml").write_text(text, encoding="utf-8")
             checked = call("check", f"{name}.yaml")
@@ -98,10 +99,10 @@ def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., 
 def test_the_mast_stands_beside_whom_it_looks_at(tmp_path: Path) -> None:
     """Pedestrian 7 is at (30, 6), all drive along y = 0 and −4: 10 m to his north-east nobody else is nearer."""
     write_recording(tmp_path / "log.mcap", street(), host=1)
-    (truth,) = survey(tmp_path / "log.mcap")["truth"]
-    first, second = truth["suggested"]["masts"]
-    assert first == {"at": [37.1, 13.1], "yaw_deg": -135}
-    assert second == {"at": [22.9, -1.1], "yaw_deg": 45}
+    (truth,) = survey(tmp_path / "log.mcap").truth
+    first, second = truth.suggested.masts
+    assert first == Mast(at=[37.1, 13.1], yaw_deg=-135)
+    assert second == Mast(at=[22.9, -1.1], yaw_deg=45)
 
 
 def test_without_a_host_whoever_drives_longest_and_it_is_said(tmp_path: Path, replayed: Callable[..., Any]) -> None:
@@ -388,8 +389,8 @@ def test_real_recordings(replayed: Callable[..., Any], path: Path | None) -> Non
     found = survey(path)
     assert len(short(found)) <= 13
     assert all(len(line) <= 120 for line in short(found)[2:])
-    place = np.array([mast["at"] for mast in found["truth"][0]["suggested"]["masts"]])
-    (x0, x1), (y0, y1) = found["truth"][0]["x_m"], found["truth"][0]["y_m"]
+    place = np.array([mast.at for mast in found.truth[0].suggested.masts])
+    (x0, x1), (y0, y1) = found.truth[0].x_m, found.truth[0].y_m
     assert ((place >= [x0 - 10, y0 - 10]) & (place <= [x1 + 10, y1 + 10])).all()
     if path.stat().st_size < 300_000:  # the others take a while: the same commands by hand
         replayed(path)

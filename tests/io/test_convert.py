@@ -31,8 +31,8 @@ def test_the_file_is_whole_the_same_again_and_read_by_info(run: Runner) -> None:
     run("csv", source)
     assert run.output.read_bytes() == first
     found = survey(run.output)
-    assert found["readable"]
-    assert [topic["topic"] for topic in found["topics"]] == ["ground_truth"]
+    assert found.readable
+    assert [topic.topic for topic in found.topics] == ["ground_truth"]
 
 
 def test_it_runs_as_a_command(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_what_is_there_already_is_replaced_only_when_that_is_asked_for(
     assert capsys.readouterr().err == f"{there}: is there already; give another name, or --overwrite\n"
     assert there.read_text() == "of another day"
     assert convert(*words, "--overwrite") == 0
-    assert survey(there)["readable"]
+    assert survey(there).readable
     assert sorted(path.name for path in run.folder.iterdir()) == ["table.csv", "there.mcap"]
 
 

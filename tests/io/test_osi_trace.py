@@ -16,6 +16,7 @@ from osi3trace.osi_trace import OSITrace
 
 from copem_replay.cli.main import main
 from copem_replay.core.errors import RecordingError
+from copem_replay.experiment.draft.findings import TopicFound
 from copem_replay.experiment.draft.survey import survey
 from copem_replay.io.open import open_log
 from copem_replay.io.recorded_osi import read_recorded
@@ -63,7 +64,7 @@ def problem(path: Path) -> str:
     with pytest.raises(RecordingError) as caught:
         read(path, name="log")
     (line,) = caught.value.problems
-    assert survey(path)["reason"] == line
+    assert survey(path).reason == line
     return line.removeprefix(f"{path}: ")
 
 
@@ -94,8 +95,8 @@ def test_lists_of_a_unit(tmp_path):
     lists = read_recorded(path, "SensorData", truth.scene)
     assert lists.tracks.x_m[0].tolist() == [12.0] * 30
     assert lists.existence.tolist() == [0.75] * 30
-    assert survey(path)["topics"] == [
-        {"topic": "SensorData", "schema": "osi3.SensorData", "encoding": "protobuf", "messages": 30, "role": "unit"}
+    assert survey(path).topics == [
+        TopicFound(topic="SensorData", schema="osi3.SensorData", encoding="protobuf", messages=30, role="unit")
     ]
     assert problem(path).startswith("no list of true objects; it holds osi3.SensorData on SensorData; ")
 

@@ -20,7 +20,8 @@ from rosbags.rosbag2 import Writer as RosWriter
 
 from copem_replay.cli.main import main
 from copem_replay.core.errors import RecordingError
-from copem_replay.experiment.draft.survey import describe, survey
+from copem_replay.experiment.draft.survey import survey
+from copem_replay.experiment.draft.survey_text import describe
 from copem_replay.io.containers.rosbag2 import merged
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
@@ -64,7 +65,7 @@ def problem(path: Path) -> str:
         read(path, name="log")
     (line,) = caught.value.problems
     assert line.isprintable()
-    assert survey(path)["reason"] == line
+    assert survey(path).reason == line
     return line.replace(f"{path}", "BAG")
 
 

@@ -48,7 +48,7 @@ def line(path: Path) -> str:
         read(path, name="log")
     (problem,) = caught.value.problems
     assert problem.isprintable()
-    assert survey(path)["reason"] == problem
+    assert survey(path).reason == problem
     return problem.removeprefix(f"{path}: ")
 
 

@@ -12,6 +12,7 @@ from copem_replay.io.window import WindowSeconds
 
 if TYPE_CHECKING:  # of types alone
     from copem_replay.cli.api.study import AnyExperiment, AnyPath
+    from copem_replay.experiment.draft.findings import Survey
     from copem_replay.io.config import EgoTopic
 
 
@@ -82,9 +83,10 @@ def inspect_recording(path: AnyPath) -> dict[str, Any]:
     >>> found["readable"], [topic["role"] for topic in found["topics"]]
     (True, ['truth'])
     """
+    from copem_replay.experiment.draft.findings import as_json
     from copem_replay.experiment.draft.survey import survey
 
-    return survey(Path(path))
+    return as_json(survey(Path(path)))
 
 
 def draft_experiment(path: AnyPath) -> str:
@@ -99,7 +101,7 @@ def draft_experiment(path: AnyPath) -> str:
     """
     text, found = draft_of(Path(path))
     if text is None:
-        raise RecordingError(found["reason"])
+        raise RecordingError(found.reason or f"{path}: no list of true objects")
     encodable(path)
     return text
 
@@ -112,9 +114,10 @@ def encodable(path: AnyPath) -> None:
         raise RecordingError(f"{path}: its path is not UTF-8: no experiment could name it") from None
 
 
-def draft_of(path: Path) -> tuple[str | None, dict[str, Any]]:
+def draft_of(path: Path) -> tuple[str | None, Survey]:
     """The draft, None where no list of true objects is readable, and the survey it is made from."""
+    from copem_replay.experiment.draft.survey import survey
     from copem_replay.experiment.draft.template import commented, proposed
 
-    found = inspect_recording(path)
-    return (commented(found) if found["readable"] else proposed(found)), found
+    found = survey(path)
+    return (commented(found) if found.readable else proposed(found)), found

@@ -1,16 +1,17 @@
-"""What an experiment on a recording could be: whose eyes, who is measured, where a mast would stand.
+"""What an experiment on a recording could be: the ego, the measured objects, the place of a mast.
 
 Guesses from what is in the log, to begin with; each says why.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
+from copem_replay.experiment.draft.findings import Mast, Suggestion
 from copem_replay.io.channel import schema_name
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.recording import Recording, foreign, read_log
@@ -20,21 +21,19 @@ if TYPE_CHECKING:
     from copem_replay.io.schemas.description import Fields
 
 RANGE_M = 50.0
-"""`in_range` of the contract: nearer than this to the ego, an object is measured."""
+"""Nearer than this to the ego an object is measured: the default of the onset `in_range`."""
 MAST_M = 10.0
 """So far from the busiest place the mast stands (chosen: beside the lane, not on it)."""
 _CELL_M = 10.0  # the busiest place is sought on a grid (chosen)
-_MOVED_M = 10.0  # who came less far is parked or a pedestrian's width away from it (chosen)
+_MOVED_M = 10.0  # an object that moved less is parked, or nearly (chosen)
 _MOSTLY = 0.75  # the share of a log that an ego is there (chosen: what records a log is there from beginning to end)
 _ROWS = 100_000  # object states looked at for a place of the mast (chosen: a sample says it as well)
 _DRIVEN = ("car", "van", "truck", "bus", "vehicle", "motorcycle")
 _FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle")  # as drivers name the vehicle's own
 
 
-def suggestion(log: Log, recording: Recording, fields: Fields | None = None) -> dict[str, Any]:
-    """Plain data: `ego` as the experiment has it (null: the host vehicle of the log) and `ego_why`; `classes` that are
-    measured, null for all that moves, and the `onset`; `masts`: two places to look on from, the freer one first.
-    """
+def suggestion(log: Log, recording: Recording, fields: Fields | None = None) -> Suggestion:
+    """Guess what an experiment on a recording could be."""
     ego, why, recording = _ego(log, recording, fields)
     scene, truth = recording.scene, recording.truth
     objects = truth.row_object_ix
@@ -42,13 +41,7 @@ def suggestion(log: Log, recording: Recording, fields: Fields | None = None) -> 
     classes, onset, rows = _measured(scene, truth, number)
     if not len(rows):
         rows = np.arange(len(objects))
-    return {
-        "ego": ego,
-        "ego_why": why,
-        "classes": classes,
-        "onset": onset,
-        "masts": _masts(truth, rows, objects),
-    }
+    return Suggestion(ego, why, classes, onset, _masts(truth, rows, objects))
 
 
 def _ego(log: Log, recording: Recording, fields: Fields | None) -> tuple[str | dict[str, str] | None, str, Recording]:
@@ -82,8 +75,8 @@ def _poses(log: Log) -> list[dict[str, str]]:
     if not foreign(log):
         return []
     from copem_replay.io.encodings.raw_values import DefinitionError
+    from copem_replay.io.messages import gathered
     from copem_replay.io.schemas.poses import poses_of
-    from copem_replay.io.world_frame import gathered
 
     found: list[tuple[int, dict[str, str]]] = []
     for channel in foreign(log):
@@ -168,7 +161,7 @@ def _near(truth: Tracks, objects: Int, ego_ix: int) -> Bool:
     return np.asarray(away <= RANGE_M)  # NaN, the ego is not there: no
 
 
-def _masts(truth: Tracks, rows: Int, objects: Int) -> list[dict[str, Any]]:
+def _masts(truth: Tracks, rows: Int, objects: Int) -> list[Mast]:
     """Two places that face each other across where most measured objects come by, the one farther from all first."""
     rows = rows[:: max(1, len(rows) // _ROWS)]
     x, y = truth.x_m[0, rows], truth.y_m[0, rows]
@@ -191,7 +184,7 @@ def _free_m(everyone: Float, place: Float) -> float:
     return float(np.hypot(*(everyone - place).T).min())
 
 
-def _mast(centre: Float, turn: float) -> dict[str, Any]:
+def _mast(centre: Float, turn: float) -> Mast:
     at = centre + MAST_M * np.array([np.cos(turn), np.sin(turn)])
     facing = round(np.rad2deg(turn)) - 180
-    return {"at": [round(float(v), 1) for v in at], "yaw_deg": facing + 360 if facing <= -180 else facing}
+    return Mast([round(float(v), 1) for v in at], facing + 360 if facing <= -180 else facing)

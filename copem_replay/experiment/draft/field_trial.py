@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import replace
 
 from pydantic import ValidationError
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.draft.field_guess import propose, stamp_paths
+from copem_replay.experiment.draft.findings import ProposalFound
 from copem_replay.io.channel import Channel
 from copem_replay.io.encodings.columns import take_apart
 from copem_replay.io.encodings.definition import definition_of
@@ -28,12 +29,8 @@ _OFFERS = 40
 """So many fields are named where not all were found (chosen)."""
 
 
-def proposals(log: Log, name: str) -> Iterator[tuple[dict[str, Any], Recording | None]]:
-    """Of each channel that looks like a list of objects: plain data, and what it is read as, None where it is not.
-
-    `read`: as the experiment has it, of what was found; `missing`: needed keys that were not; `others`: for some keys
-    what else could be meant; `offers`: fields there are; `problem`: why it was not read.
-    """
+def proposals(log: Log, name: str) -> Iterator[tuple[ProposalFound, Recording | None]]:
+    """Each channel that looks like a list of objects, and what it is read as, None where it is not."""
     unknown = [c for c in foreign(log) if not is_list(c) and not is_pose(c)]
     for channel in unknown[:_CHANNELS]:
         try:
@@ -43,20 +40,24 @@ def proposals(log: Log, name: str) -> Iterator[tuple[dict[str, Any], Recording |
         if found is None:
             continue
         recording, problem = None, None
-        if not found["missing"]:
+        if not found.missing:
             try:
-                fields = Fields.model_validate({key: v for key, v in found["read"].items() if key != "topic"})
-                recording = read_log(log, name=name, topic=channel.topic, fields=fields)
+                recording = read_log(log, name=name, topic=channel.topic, fields=fields_of(found))
             except RecordingError as error:
                 problem = "; ".join(error.within(log.path))
             except BrokenIndexError as error:
                 problem = error.reason
             except ValidationError as error:
                 problem = str(error)
-        yield found | {"problem": problem}, recording
+        yield replace(found, problem=problem), recording
 
 
-def _proposed(log: Log, channel: Channel) -> dict[str, Any] | None:
+def fields_of(found: ProposalFound) -> Fields:
+    """The fields as they are proposed. Raises ValidationError."""
+    return Fields.model_validate({key: value for key, value in found.read.items() if key != "topic"})
+
+
+def _proposed(log: Log, channel: Channel) -> ProposalFound | None:
     samples = list(itertools.islice(log.payloads(frozenset({channel.number})), _SAMPLES))
     payloads, times = [data for _, _, data in samples], [at for _, at, _ in samples]
     definition = definition_of(channel, payloads)
@@ -67,11 +68,11 @@ def _proposed(log: Log, channel: Channel) -> dict[str, Any] | None:
     found = propose(offers, words, [times[m] for m in said.parent])
     if found is None:
         return None
-    return {
-        "topic": channel.topic,
-        "schema": channel.schema,
-        "read": {"topic": channel.topic, **found.read},
-        "missing": list(found.missing),
-        "others": {key: list(paths) for key, paths in found.others.items()},
-        "offers": list(offers)[:_OFFERS],
-    }
+    return ProposalFound(
+        topic=channel.topic,
+        schema=channel.schema,
+        read={"topic": channel.topic, **found.read},
+        missing=list(found.missing),
+        others={key: list(paths) for key, paths in found.others.items()},
+        offers=list(offers)[:_OFFERS],
+    )

@@ -1,4 +1,4 @@
-"""The experiment that would replay a recording, as text: from what `info.survey` found, to begin with.
+"""The experiment that would replay a recording, as text: from what a look at it found, to begin with.
 
 `short` is what `info` ends with; `commented` is what `init` writes.
 """
@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
+
+from copem_replay.experiment.draft.findings import ProposalFound, Suggestion, Survey, TruthFound, UnitFound
 
 _PLAIN = re.compile(r"(?:[A-Za-z_/]|\.{1,2}/)(?:[A-Za-z0-9_./-]*[A-Za-z0-9_/])?")
 """Text that means itself, in YAML, without quotes, in a list or out of it."""
@@ -17,25 +20,24 @@ _GENERIC = {"objects", "object", "sensordata", "detections", "tracks", "lists", 
 _OTHERS = 6  # topics named in a comment (chosen)
 
 
-def main_truth(survey: dict[str, Any]) -> dict[str, Any]:
+def main_truth(survey: Survey) -> TruthFound:
     """Of the lists of true objects that were read, the one with the most object states."""
-    truth: dict[str, Any] = max(survey["truth"], key=lambda truth: truth["states"])
-    return truth
+    return max(survey.truth, key=lambda truth: truth.states)
 
 
-def short(survey: dict[str, Any]) -> list[str]:
+def short(survey: Survey) -> list[str]:
     """The experiment in as few lines as show its parts."""
     truth = main_truth(survey)
-    guess = truth["suggested"]
-    ego, recorded = guess["ego"] != "none", _recorded(truth)[:1]
-    masts = [] if ego and recorded else guess["masts"][:1]
-    lines = ["version: 1", f"logs: [{quoted(survey['log'])}]"]
-    lines += [f"read: {{topic: {quoted(truth['topic'])}}}"] if survey["choice"] else []
-    lines += [f"ego: {_ego_value(guess['ego'])}"] if guess["ego"] is not None else []
+    guess = truth.suggested
+    ego, recorded = guess.ego != "none", _recorded(truth)[:1]
+    masts = [] if ego and recorded else guess.masts[:1]
+    lines = ["version: 1", f"logs: [{quoted(survey.log)}]"]
+    lines += [f"read: {{topic: {quoted(truth.topic)}}}"] if survey.choice else []
+    lines += [f"ego: {_ego_value(guess.ego)}"] if guess.ego is not None else []
     error = "error: {kind: gaussian, covariance_m2: [[1.0, 0.0], [0.0, 1.0]]}"
     lines += [f"pems: {{eyes: [{{detection: {{kind: visible_share}}, {error}}}]}}", "units:"]
     lines += ["  ego: {on: ego, pem: eyes}"] if ego else []
-    lines += [f"  roadside: {{at: {_list(m['at'])}, height_m: 6.0, pem: eyes}}" for m in masts]
+    lines += [f"  roadside: {{at: {_list(m.at)}, height_m: 6.0, pem: eyes}}" for m in masts]
     lines += [f"  {name}: {{recorded: {_recorded_value(unit)}}}" for name, unit in recorded]
     first = "ego" if ego else "roadside"
     lines += ["configurations:", "  GT: {units: truth}", f"  PEM: {{units: [{first}]}}"]
@@ -45,27 +47,27 @@ def short(survey: dict[str, Any]) -> list[str]:
         lines.append(f"  {'coPEM' if ego else name}: {{units: {units}}}")
     elif ego:
         lines.append("  coPEM: {units: all, latency_s: 0.5}")
-    parts = [f"objects: {{classes: {_list(guess['classes'])}}}"] if guess["classes"] else []
-    parts += ["onset: {kind: appears}"] if guess["onset"] == "appears" else []
+    parts = [f"objects: {{classes: {_list(guess.classes)}}}"] if guess.classes else []
+    parts += ["onset: {kind: appears}"] if guess.onset == "appears" else []
     parts += [] if ego else ["distance_to: roadside"]
     return lines + ([f"measure: {{{', '.join(parts)}}}"] if parts else [])
 
 
-def commented(survey: dict[str, Any]) -> str:
+def commented(survey: Survey) -> str:
     """The experiment with a word on each key; it runs as it is."""
     truth = main_truth(survey)
-    guess = truth["suggested"]
+    guess = truth.suggested
     recorded = _recorded(truth)
-    ego = guess["ego"] != "none"
+    ego = guess.ego != "none"
     first = ["ego", "roadside"] if ego else ["roadside", "across"]
     lines = [
-        f"# Replays {_plain(survey['recording'])}, {truth['span_s']:.1f} s: {_objects(truth)}.",
+        f"# Replays {_plain(survey.recording)}, {truth.span_s:.1f} s: {_objects(truth)}.",
         "# Written by `copem-replay init`, to begin with.",
         "#",
         "#   copem-replay check experiment.yaml",
         "#   copem-replay run experiment.yaml && copem-replay view out/experiment",
         "version: 1",
-        f"logs: [{quoted(survey['log'])}]   # relative to this file, or absolute; globs work",
+        f"logs: [{quoted(survey.log)}]   # relative to this file, or absolute; globs work",
         *_read(survey, truth),
         *_ego(truth, guess),
         "runs: 20   # each with its own draws, the same in all configurations; more make the intervals narrower",
@@ -78,7 +80,7 @@ def commented(survey: dict[str, Any]) -> str:
         *_ROADSIDE,
         "",
         "units:",
-        *_units(guess, recorded, truth["units"], ego=ego),
+        *_units(guess, recorded, truth.units, ego=ego),
         "",
         "configurations:",
         *_configurations(first, [name for name, _ in recorded], ego=ego),
@@ -89,36 +91,36 @@ def commented(survey: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def proposed(survey: dict[str, Any]) -> str | None:
+def proposed(survey: Survey) -> str | None:
     """The experiment on a list that is read by the names of its fields; None: of no proposal all needed was found."""
-    whole = [proposal for proposal in survey["proposals"] if proposal["truth"] is not None]
+    whole = [(truth, proposal) for proposal in survey.proposals if (truth := proposal.truth) is not None]
     if not whole:
         return None
-    best = max(whole, key=lambda proposal: proposal["truth"]["states"])
-    return commented(survey | {"truth": [best["truth"]], "proposals": [best]})
+    truth, best = max(whole, key=lambda one: one[0].states)
+    return commented(replace(survey, truth=[truth], proposals=[best]))
 
 
-def unfinished(survey: dict[str, Any]) -> str:
+def unfinished(survey: Survey) -> str:
     """`read:` of each proposal as comments, with what is missing and what the messages have."""
     lines = []
-    for proposal in survey["proposals"]:
-        lines += [f"# {_plain(proposal['topic'])} ({_plain(proposal['schema'])}) may be a list of objects:"]
+    for proposal in survey.proposals:
+        lines += [f"# {_plain(proposal.topic)} ({_plain(proposal.schema)}) may be a list of objects:"]
         lines += [f"# {line}" for line in read_block(proposal)]
-        lines += [f"# its messages have: {_plain(', '.join(proposal['offers']))}"]
-        lines += [f"# {_plain(proposal['problem'])}"] if proposal["problem"] else []
+        lines += [f"# its messages have: {_plain(', '.join(proposal.offers))}"]
+        lines += [f"# {_plain(proposal.problem)}"] if proposal.problem else []
     return "\n".join(lines) + "\n" if lines else ""
 
 
-def read_block(proposal: dict[str, Any]) -> list[str]:
+def read_block(proposal: ProposalFound) -> list[str]:
     """`read:` as it was proposed, each key with what else it could be."""
-    read, others = proposal["read"], proposal["others"]
+    read, others = proposal.read, proposal.others
     lines = ["read:   # proposed from the names of its fields: look at each"]
     for key, value in read.items():
         line = f"  {key}: {_value(value)}"
         said = [f"or {_plain(', '.join(others[key][:_OTHERS]))}"] if key in others else []
         said += [_ON_KEYS[key]] if key in _ON_KEYS else []
         lines.append(line + (f"   # {'; '.join(said)}" if said else ""))
-    lines += [f"  # {key}: …   # needed, and not found: {_NEEDED.get(key, 'a path')}" for key in proposal["missing"]]
+    lines += [f"  # {key}: …   # needed, and not found: {_NEEDED.get(key, 'a path')}" for key in proposal.missing]
     return lines
 
 
@@ -155,23 +157,23 @@ _ROADSIDE = [
 ]
 
 
-def _objects(truth: dict[str, Any]) -> str:
-    return ", ".join(f"{number} {name}" for name, number in truth["moving"].items()) or "nothing that moves"
+def _objects(truth: TruthFound) -> str:
+    return ", ".join(f"{number} {name}" for name, number in truth.moving.items()) or "nothing that moves"
 
 
-def _read(survey: dict[str, Any], truth: dict[str, Any]) -> Iterator[str]:
-    if survey["proposals"]:
-        yield from read_block(survey["proposals"][0])
-    if not survey["choice"]:
+def _read(survey: Survey, truth: TruthFound) -> Iterator[str]:
+    if survey.proposals:
+        yield from read_block(survey.proposals[0])
+    if not survey.choice:
         return
-    others = [t["topic"] for t in survey["truth"] if t["topic"] != truth["topic"]]
-    yield f"read: {{topic: {quoted(truth['topic'])}}}   # where the truth is"
+    others = [t.topic for t in survey.truth if t.topic != truth.topic]
+    yield f"read: {{topic: {quoted(truth.topic)}}}   # where the truth is"
     yield from (f"# read: {{topic: {quoted(topic)}}}   # could be it, too" for topic in others[:_OTHERS])
 
 
-def _ego(truth: dict[str, Any], guess: dict[str, Any]) -> Iterator[str]:
+def _ego(truth: TruthFound, guess: Suggestion) -> Iterator[str]:
     """Whose eyes: as the log says, or a guess that says so."""
-    ego, why = guess["ego"], _plain(guess["ego_why"])
+    ego, why = guess.ego, _plain(guess.ego_why)
     if ego is None:
         yield f"# ego: <id>   # left out: {why}"
     elif isinstance(ego, dict):
@@ -182,14 +184,14 @@ def _ego(truth: dict[str, Any], guess: dict[str, Any]) -> Iterator[str]:
     else:
         yield f"# {why}"
         yield f"ego: {quoted(ego)}" + ("" if ego == "none" else "   # a guess; none: no ego, a mast judged by itself")
-        if ids := truth["vehicles"]:
+        if ids := truth.vehicles:
             yield f"# ego: <id>   # of {_plain(ids)}"
 
 
 def _units(
-    guess: dict[str, Any],
-    recorded: Sequence[tuple[str, dict[str, Any]]],
-    lists: Sequence[dict[str, Any]],
+    guess: Suggestion,
+    recorded: Sequence[tuple[str, UnitFound]],
+    lists: Sequence[UnitFound],
     *,
     ego: bool,
 ) -> Iterator[str]:
@@ -198,8 +200,8 @@ def _units(
         yield "  # A mast where most measured objects come by: x, y in metres as in the log, yaw_deg from the x axis"
     else:
         yield "  # Two masts that face each other where most objects come by: x, y in metres as in the log"
-    for name, mast in zip(("roadside", "across"), guess["masts"][: 1 if ego else 2], strict=False):
-        yield f"  {name}: {{at: {_list(mast['at'])}, yaw_deg: {mast['yaw_deg']}, height_m: 6.0, pem: roadside}}"
+    for name, mast in zip(("roadside", "across"), guess.masts[: 1 if ego else 2], strict=False):
+        yield f"  {name}: {{at: {_list(mast.at)}, yaw_deg: {mast.yaw_deg}, height_m: 6.0, pem: roadside}}"
     if ego:
         yield "  # others: {on: {classes: [car, truck], share: 0.3}, pem: onboard}   # carried by 30 % of them (V2V)"
     if recorded:
@@ -208,8 +210,8 @@ def _units(
     for name, unit in recorded:
         yield f"  {name}: {{recorded: {_recorded_value(unit)}}}"
     for unit in lists:
-        if unit["problem"]:
-            yield f"  # {quoted(unit['topic'])} cannot be a unit: {_plain(unit['problem'])}"
+        if unit.problem:
+            yield f"  # {quoted(unit.topic)} cannot be a unit: {_plain(unit.problem)}"
 
 
 def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool) -> Iterator[str]:
@@ -230,15 +232,15 @@ def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool)
         yield f"  {name + ':':<{width}} {value}   # {what}"
 
 
-def _measure(guess: dict[str, Any], *, ego: bool) -> Iterator[str]:
+def _measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     kinds = {"vru": "pedestrians, bicycles, motorcycles", "vehicles": "cars, trucks, …"}
     yield "measure:"
-    if guess["classes"]:
-        said = ", ".join(kinds[name] for name in guess["classes"])
-        yield f"  objects: {{classes: {_list(guess['classes'])}}}   # {said}; or {{ids: [1, 2]}}; left out: all"
+    if guess.classes:
+        said = ", ".join(kinds[name] for name in guess.classes)
+        yield f"  objects: {{classes: {_list(guess.classes)}}}   # {said}; or {{ids: [1, 2]}}; left out: all"
     else:
         yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
-    if guess["onset"] == "appears":
+    if guess.onset == "appears":
         yield "  onset: {kind: appears}   # the clock starts; nobody comes within 50 m of the ego (in_range)"
     else:
         yield "  onset: {kind: in_range, range_m: 50}   # the clock starts; or appears, starts_moving, line_of_sight"
@@ -247,26 +249,26 @@ def _measure(guess: dict[str, Any], *, ego: bool) -> Iterator[str]:
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
 
 
-def _recorded(truth: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def _recorded(truth: TruthFound) -> list[tuple[str, UnitFound]]:
     """The unit lists that could be read, by names that say which."""
-    named: dict[str, dict[str, Any]] = {}
+    named: dict[str, UnitFound] = {}
     taken = {"ego", "roadside", "across", "others", "default", "truth", "all", "gt", "pem", "copem", "gnn"}
-    for unit in truth["units"]:
-        if unit["problem"]:
+    for unit in truth.units:
+        if unit.problem:
             continue
-        words = [word for word in re.split(r"[^a-z0-9]+", unit["topic"].lower()) if word]
+        words = [word for word in re.split(r"[^a-z0-9]+", unit.topic.lower()) if word]
         telling = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
         stem = telling[-1] if telling else "recorded"
-        tries = [stem, *(f"{stem}{k}" for k in range(2, len(truth["units"]) + 3))]
+        tries = [stem, *(f"{stem}{k}" for k in range(2, len(truth.units) + 3))]
         name = next(name for name in tries if name not in taken and name not in named)
         named[name] = unit
     return list(named.items())
 
 
-def _recorded_value(unit: dict[str, Any]) -> str:
-    parts = [f"topic: {quoted(unit['topic'])}"]
-    parts += [] if unit["captures_said"] else ["delay_s: 0.0"]
-    parts += [] if unit["covariances_said"] else [f"covariance_m2: {_UNIT}"]
+def _recorded_value(unit: UnitFound) -> str:
+    parts = [f"topic: {quoted(unit.topic)}"]
+    parts += [] if unit.captures_said else ["delay_s: 0.0"]
+    parts += [] if unit.covariances_said else [f"covariance_m2: {_UNIT}"]
     return f"{{{', '.join(parts)}}}"
 
 

@@ -76,7 +76,7 @@ def is_trace(path: Path) -> bool:
 
 
 def open_trace(path: Path) -> Trace:
-    """Look at a trace. Raises RecordingError: not read, no message in it, or nobody can tell of which kind."""
+    """Look at a trace. Raises RecordingError: a kind that is not read, no message, or messages of no kind."""
     said = _NAME.match(path.name)
     schema, notes = _schema(path, said["type"] if said else "")
     kind, skipped = message_class(schema), Counter[str]()

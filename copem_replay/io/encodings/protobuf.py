@@ -80,7 +80,8 @@ class ProtobufDefinition:
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
         """Take messages apart. Raises KeyError for a path that is not offered."""
-        wanted = list(dict.fromkeys((*(numbers := tuple(numbers)), *(texts := tuple(texts)))))
+        numbers, texts = tuple(numbers), tuple(texts)
+        wanted = list(dict.fromkeys((*numbers, *texts)))
         for path in wanted:
             if path not in self._offers:
                 raise KeyError(path)

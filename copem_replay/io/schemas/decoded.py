@@ -17,6 +17,9 @@ FARTHEST_M = 1e7
 LAST_NS = 4_000_000_000 * 10**9
 """A later time is none (chosen: Unix time of 2096; differences of such times still fit 64 bits)."""
 
+X, Y, Z, YAW, VX, VY = range(6)
+"""Columns of `values`, the first of `tracks.VALUES`."""
+
 
 @dataclass(frozen=True)
 class Columns:

@@ -217,48 +217,70 @@ class _Reader:
             self._notes["cube", "beside a larger one of the same entity: left out"] += beside
         return chosen
 
-    def listed(self, log_time_ns: Int) -> Listed:
-        """All columns."""
-        fields, found, taken = self._fields, self._found, self._meant()
-        if lost := int((~found.decoded).sum()):
-            self._notes["message", "cannot be decoded: skipped"] += lost
-        stamp_ns, stamped = self._stamps(log_time_ns)
-        yaw = self._yaw()
-        vx, vy = (self._amount(p, np.nan) for p in (fields.vx_mps, fields.vy_mps))
-        if fields.velocity == "object":
+    def _velocity(self, yaw: Float) -> tuple[Float, Float]:
+        """(P,) each along the axes of the list's frame, NaN: not said."""
+        vx, vy = (self._amount(path, np.nan) for path in (self._fields.vx_mps, self._fields.vy_mps))
+        if self._fields.velocity == "object":
             cos, sin = np.cos(yaw), np.sin(yaw)
             vx, vy = vx * cos - vy * sin, vx * sin + vy * cos
-        vx, vy = (np.where(self._said("velocity"), v, np.nan) for v in (vx, vy))
-        values = np.stack(
+        said = self._said("velocity")
+        return np.where(said, vx, np.nan), np.where(said, vy, np.nan)
+
+    def _values(self) -> Float:
+        """(P, V) values of the objects, in the order of VALUES."""
+        fields, yaw = self._fields, self._yaw()
+        return np.stack(
             [
                 self.number(fields.x_m),
                 self.number(fields.y_m),
                 self._amount(fields.z_m, 0.0),
                 yaw,
-                vx,
-                vy,
+                *self._velocity(yaw),
                 self._amount(fields.length_m, np.nan),
                 self._amount(fields.width_m, np.nan),
                 self._amount(fields.height_m, 0.0),
             ],
             axis=1,
         )
-        taken = self._shaped(values, taken)
-        message = found.levels[""].parent[rows_above(found, fields.objects, "")]
-        ids = self._ids()
-        nameless = np.zeros(len(taken), dtype=bool) if ids is None else (ids.code < 0) & taken
-        if ids is not None and nameless.any():
-            self._notes["object state", "without an id: skipped"] += int(nameless.sum())
-        keep = np.flatnonzero(taken & ~nameless)
-        kept_message = np.flatnonzero(found.decoded)
-        probability = self._classes()
-        number, names = (
-            (np.arange(len(keep)), tuple(str(k) for k in range(len(keep))))
-            if ids is None
-            else (ids.code[keep], ids.words)
-        )
+
+    def _kept(self, meant: Bool, ids: Texts | None) -> Int:
+        """(K,) rows of the objects that are meant and have an id, if objects have ids; notes what of them is unsaid."""
+        if ids is not None:
+            nameless = (ids.code < 0) & meant
+            meant = meant & ~nameless
+            if nameless.any():
+                self._notes["object state", "without an id: skipped"] += int(nameless.sum())
+        keep = np.flatnonzero(meant)
         if unsaid := int((~self._said("yaw")[keep]).sum()):
             self._notes["object state", "that does not say its heading: as written"] += unsaid
+        return keep
+
+    def _covariance(self, keep: Int) -> Float:
+        """(K, 3) xx, xy, yy of the positions, NaN: not said."""
+        path = self._fields.covariance
+        if path is None:
+            return np.full((len(keep), 3), np.nan)
+        covariance: Float = np.stack([self.number(f"{path}[{k}]")[keep] for k in (0, 1, 7)], axis=1)
+        covariance[~self._said("covariance")[keep]] = np.nan
+        return covariance
+
+    def listed(self, log_time_ns: Int) -> Listed:
+        """All columns of the objects that are kept. Notes stand in the order in which things are found out."""
+        found, meant = self._found, self._meant()
+        if lost := int((~found.decoded).sum()):
+            self._notes["message", "cannot be decoded: skipped"] += lost
+        stamp_ns, stamped = self._stamps(log_time_ns)
+        values = self._values()
+        meant = self._shaped(values, meant)
+        ids = self._ids()
+        keep = self._kept(meant, ids)
+        number = np.arange(len(keep)) if ids is None else ids.code[keep]
+        names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
+        message = found.levels[""].parent[rows_above(found, self._fields.objects, "")]
+        kept_message = np.flatnonzero(found.decoded)
+        probability = self._classes()[keep]
+        life = self._description.life
+        gone = () if life is None else life_notes(found, life, stamp_ns, stamped)
         columns = Columns(
             stamp_ns=stamp_ns[kept_message],
             stamped=stamped[kept_message],
@@ -266,29 +288,18 @@ class _Reader:
             object_ids=names,
             moving=np.ones(len(names), dtype=bool),
             object_ix=number.astype(np.int64),
-            class_ix=probability[keep].argmax(axis=1).astype(np.int8),
+            class_ix=probability.argmax(axis=1).astype(np.int8),
             values=values[keep],
-            notes=(
-                *(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()),
-                *(
-                    ()
-                    if self._description.life is None
-                    else life_notes(found, self._description.life, stamp_ns, stamped)
-                ),
-            ),
+            notes=(*(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()), *gone),
         )
         frame, frames = self._frame_of()
-        covariance = np.full((len(keep), 3), np.nan)
-        if fields.covariance is not None:
-            covariance = np.stack([self.number(f"{fields.covariance}[{k}]")[keep] for k in (0, 1, 7)], axis=1)
-            covariance[~self._said("covariance")[keep]] = np.nan
         return Listed(
             columns,
             frame[keep],
             frames,
-            self._amount(fields.existence, np.nan)[keep],
-            covariance,
-            probability[keep],
+            self._amount(self._fields.existence, np.nan)[keep],
+            self._covariance(keep),
+            probability,
             log_time_ns[kept_message],
             ids is not None,
         )
