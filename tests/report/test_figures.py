@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -74,7 +74,7 @@ braking: {driver: {kind: constant_deceleration, a_max_mps2: 8.0, reaction: {kind
 show: null
 """
 TWO = "measure: {objects: {ids: [2]}, onset: {kind: at, time_s: 0.5}}"
-NAMES = ("runs", "distances", "curves")
+NAMES = ("runs", "curves", "distances", "latency_breakdown")
 
 
 def drive(path: Path) -> Path:
@@ -185,7 +185,7 @@ class TestCommand:
         monkeypatch.setitem(matplotlib.rcParams, "font.size", 20.0)  # whatever the user likes
         monkeypatch.setenv("SOURCE_DATE_EPOCH", "1")
         second, _ = write_figures(load_results(results.folder), tmp_path / "b")
-        assert len(first) == 6
+        assert len(first) == 8
         assert {p.name: p.read_bytes() for p in first} == {p.name: p.read_bytes() for p in second}
         for path in first:
             content = path.read_bytes()
@@ -226,8 +226,10 @@ class TestCommand:
         assert text.startswith("note: no figure of runs: ")
         assert said in text
         # Nor does an old one stay, of a log that is no more.
-        assert [Path(out).name for out in ended.out] == ["distances.png", "distances.svg", "curves.png", "curves.svg"]
-        assert {p.stem for p in (mine / "figures").iterdir()} == {"distances", "curves"}
+        assert [Path(out).name for out in ended.out] == [
+            f"{name}.{kind}" for name in NAMES[1:] for kind in ("png", "svg")
+        ]
+        assert {p.stem for p in (mine / "figures").iterdir()} == set(NAMES[1:])
 
     @pytest.mark.parametrize(
         ("options", "said"),
@@ -305,15 +307,15 @@ class TestCommand:
         ended = call(mine, "--out", mine / "summary.csv")
         assert ended.code == 2
         assert ended.lines[0].endswith("expected a folder, found a file; choose another with --out")
-        write = Figure.savefig
+        write = Path.write_bytes
 
-        def full(figure: Figure, path: Path, **more: Any) -> None:
+        def full(path: Path, content: bytes) -> int:
             if path.name == "curves.svg":
                 path.write_text("half")
                 raise OSError(28, "No space left on device")
-            write(figure, path, **more)
+            return write(path, content)
 
-        monkeypatch.setattr(Figure, "savefig", full)
+        monkeypatch.setattr(Path, "write_bytes", full)
         ended = call(mine, "--out", tmp_path / "new")
         assert (ended.code, ended.out) == (2, [])
         assert ended.lines == [f"{tmp_path}/new: cannot be written: No space left on device; choose another with --out"]
@@ -612,7 +614,10 @@ class TestSweeps:
         assert [Path(out).name for out in ended.out[-2:]] == ["sweeps.png", "sweeps.svg"]
         ended = call(swept.folder, "--configurations", "never")
         assert (ended.code, len(ended.out)) == (0, 6)
-        assert ended.lines == [f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never"]
+        assert ended.lines == [
+            "note: no figure of latency_breakdown: nothing was detected",
+            f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never",
+        ]
 
     def test_none(self, results: Results) -> None:
         with pytest.raises(InputError, match=r"expected sweep\.csv in it, found none"):
@@ -636,7 +641,7 @@ class TestWords:
         text = changed("runs: 1").replace("  late:", '  "$a$_{<&>}":').replace("  hit:", '  "_試":')
         results = load_results(replayed(tmp_path, text))
         files, notes = write_figures(results)
-        assert (len(files), notes) == (6, [])
+        assert (len(files), notes) == (8, [])
         labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
 

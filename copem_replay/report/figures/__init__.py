@@ -12,13 +12,17 @@
 
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.distances import distances_figure
+from copem_replay.report.figures.registry import FIGURES, FigureKind, Selection
 from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.write import write_figures
 from copem_replay.results.read import Results, load_results
 
 __all__ = [
+    "FIGURES",
+    "FigureKind",
     "Results",
+    "Selection",
     "curves_figure",
     "distances_figure",
     "load_results",
