@@ -1,4 +1,4 @@
-"""The waterfall: where the time from the clock's start to knowing goes, stage by stage.
+"""The figure of stages: where the time from the clock's start to the detection goes.
 
 | stage | from | to |
 |---|---|---|
