@@ -36,7 +36,9 @@ from copem_replay.report.figures import (
     Results,
     curves_figure,
     distances_figure,
+    latency_breakdown_figure,
     load_results,
+    one_by_one_figure,
     runs_figure,
     sweeps_figure,
     write_figures,
@@ -622,6 +624,44 @@ class TestSweeps:
     def test_none(self, results: Results) -> None:
         with pytest.raises(InputError, match=r"expected sweep\.csv in it, found none"):
             sweeps_figure(results)
+
+
+class TestOneByOne:
+    def test_a_panel_each_with_the_same_curve_and_its_band(self, results: Results) -> None:
+        together = curves_figure(results).axes[0]
+        figure = one_by_one_figure(results)
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        names = tuple(results.experiment.configurations)
+        assert [axes.get_title(loc="left").partition(":")[0] for axes in shown] == list(names)
+        for axes, name in zip(shown, names, strict=True):
+            for found, expected in zip(line(axes, name), line(together, name), strict=True):
+                np.testing.assert_array_equal(found, expected)
+            assert line(axes, "first")[1].tolist() == line(together, "GT")[1].tolist()
+        assert [axes.get_xlabel() for axes in shown] == ["", "", *["Time since the onset (s)"] * 3]
+
+    def test_only_where_bands_would_hide_each_other(
+        self, results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("copem_replay.report.figures.registry.MOST_BANDS", 3)
+        names = ["GT", "late", "near", "hit"]
+        files, _ = write_figures(results, tmp_path / "four", configurations=names)
+        assert "one_by_one.svg" in {path.name for path in files}
+        files, _ = write_figures(results, tmp_path / "three", configurations=names[:3])
+        assert "one_by_one.svg" not in {path.name for path in files}
+
+
+class TestLatencyBreakdown:
+    def test_bars_add_up_to_the_mean_time_of_what_is_detected(self, results: Results) -> None:
+        (axes,) = latency_breakdown_figure(results).axes
+        names = list(results.experiment.configurations)
+        assert [tick.get_text() for tick in axes.get_yticklabels()] == names
+        bars = [bar for group in axes.containers if group.get_label() != "_edge" for bar in group.patches]
+        for k, name in enumerate(names):
+            rows = results.table[(results.table["configuration"] == name) & results.table["detected"]]
+            mine = [bar for bar in bars if bar.get_y() < k < bar.get_y() + bar.get_height()]
+            spent_s = rows["detection_s"] - rows["onset_s"]
+            assert sum(bar.get_width() for bar in mine) == pytest.approx(spent_s.mean() if len(rows) else 0.0)
+        assert "never known" in [text.get_text().strip() for text in axes.texts]
 
 
 class TestWords:
