@@ -2,12 +2,12 @@
 
 | module | does |
 |---|---|
-| `study` | what is read: results, provenance, comparisons, who is compared with whom |
-| `answer`, `described` | the question and the answer in words; what was compared |
-| `tables`, `never`, `provenance` | tables: summary and regret, who was never detected, what made the results |
-| `curves`, `distances`, `waterfall`, `sweeps` | figures, as plotly.js draws them |
-| `drawing`, `markup` | how figures look; HTML of which nothing is taken literally that comes from users |
-| `page`, `write` | the page, and the file |
+| `html/study` | what is read: results, provenance, comparisons, the baseline |
+| `html/conclusions`, `html/setup` | the question and the answer in words; what was compared |
+| `html/tables`, `html/missed_objects`, `html/latency_breakdown`, `html/provenance` | tables |
+| `figures/registry` | all figures, for `plot` and for the page |
+| `html/embedded`, `html/swatches`, `html/markup` | figures in a page; HTML that takes no text of users literally |
+| `html/page`, `html/write` | the page, and the file |
 """
 
 from copem_replay.report.html.write import REPORT, check_report, write_report

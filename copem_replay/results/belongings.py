@@ -14,9 +14,10 @@ from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.scratch import is_scratch
 
 MARK = "provenance.json"
+_FIGURES = ("runs", "curves", "one_by_one", "distances", "latency_breakdown", "sweeps")
 _MADE_OF_RESULTS = {
     "report.html",
-    *(f"figures/{name}.{kind}" for name in ("runs", "distances", "curves", "sweeps") for kind in ("png", "svg")),
+    *(f"figures/{name}.{kind}" for name in _FIGURES for kind in ("png", "svg")),
 }
 """What `report` and `plot` make: not in the list of files, and true of the results they were made of alone."""
 

@@ -119,6 +119,7 @@ def _fill(
     for log in shown_logs(experiment, result) if exporters else ():
         for shown in shown_runs(experiment, result, log):
             target = scratch / _target(shown, log, recordings)
+            target.parent.mkdir(parents=True, exist_ok=True)
             run = _run_to_export(log, shown, experiment, recordings, result)
             said = [line for exporter in exporters for line in exporter.write(Path(f"{target}{exporter.suffix}"), run)]
             notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]

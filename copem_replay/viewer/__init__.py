@@ -14,7 +14,7 @@
 | `plots/visible_share/<object>/mark 1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | believed to true position at the instant the list is available |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
-| `…/difference/…`, `plots/error_difference` | where configurations are compared with a baseline (`viewer/differences.py`) |
+| `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/differences.py`) |
 | `events/onsets`, `events/<configuration>`, `difference`, `summary`, `legend` | in words |
 
 Columns are sent in slices of time, an entity holds all its objects: hundreds of entities slow the viewer down. It shows

@@ -92,7 +92,9 @@ class Cell:
 
 @dataclass
 class Page(HTMLParser):
-    """Elements with their attributes; what there is to read; tables by id, as rows of cells by name."""
+    """Elements with their attributes, those of figures by themselves; what there is to read; tables by id, as rows of
+    cells by name; ids of the figures.
+    """
 
     html: str
     elements: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
@@ -100,18 +102,20 @@ class Page(HTMLParser):
     head: str = ""
     tables: dict[str, dict[str, dict[str, Cell]]] = field(default_factory=dict)
     rows: dict[str, list[list[str]]] = field(default_factory=dict)
-    data: str = ""
+    drawn: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
+    plots: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__init__()
         self._open: list[str] = []
+        self._plot: int | None = None
         self._table, self._row, self._cell = "", "", Cell()
-        self._data = False
         self.feed(self.html)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         found = dict(attrs)
-        self.elements.append((tag, found))
+        inside = self._plot is not None and len(self._open) > self._plot
+        (self.drawn if inside else self.elements).append((tag, found))
         if tag not in ("meta", "link", "wbr"):  # that have no end
             self._open.append(tag)
         if tag == "header":
@@ -127,10 +131,14 @@ class Page(HTMLParser):
             column = found.get("data-column")
             if column is not None:
                 self.tables[self._table].setdefault(self._row, {})[column] = self._cell
-        self._data = tag == "script" and found.get("id") == "figures"
+        if found.get("class") == "plot":
+            self.plots.append(found.get("id") or "")
+            self._plot = self._open.index("div", len(self._open) - 1)
 
     def handle_endtag(self, tag: str) -> None:
         assert self._open.pop() == tag, "elements are nested"
+        if self._plot == len(self._open):
+            self._plot = None
         if tag in ("td", "th"):
             self.rows[self._table][-1].append(self._cell.text)
         if tag in ("p", "li", "h1", "h2", "h3"):
@@ -140,9 +148,7 @@ class Page(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         last = next((tag for tag in reversed(self._open) if tag in ("script", "style", "td", "th", "body")), "")
-        if self.cdata_elem is not None:
-            self.data += data if self._data else ""
-        elif last in ("td", "th"):
+        if last in ("td", "th"):
             self._cell.text += data
         self.words += data if self.cdata_elem is None else ""
 

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -36,7 +36,9 @@ from copem_replay.report.figures import (
     Results,
     curves_figure,
     distances_figure,
+    latency_breakdown_figure,
     load_results,
+    one_by_one_figure,
     runs_figure,
     sweeps_figure,
     write_figures,
@@ -74,7 +76,7 @@ braking: {driver: {kind: constant_deceleration, a_max_mps2: 8.0, reaction: {kind
 show: null
 """
 TWO = "measure: {objects: {ids: [2]}, onset: {kind: at, time_s: 0.5}}"
-NAMES = ("runs", "distances", "curves")
+NAMES = ("runs", "curves", "distances", "latency_breakdown")
 
 
 def drive(path: Path) -> Path:
@@ -185,7 +187,7 @@ class TestCommand:
         monkeypatch.setitem(matplotlib.rcParams, "font.size", 20.0)  # whatever the user likes
         monkeypatch.setenv("SOURCE_DATE_EPOCH", "1")
         second, _ = write_figures(load_results(results.folder), tmp_path / "b")
-        assert len(first) == 6
+        assert len(first) == 8
         assert {p.name: p.read_bytes() for p in first} == {p.name: p.read_bytes() for p in second}
         for path in first:
             content = path.read_bytes()
@@ -226,8 +228,10 @@ class TestCommand:
         assert text.startswith("note: no figure of runs: ")
         assert said in text
         # Nor does an old one stay, of a log that is no more.
-        assert [Path(out).name for out in ended.out] == ["distances.png", "distances.svg", "curves.png", "curves.svg"]
-        assert {p.stem for p in (mine / "figures").iterdir()} == {"distances", "curves"}
+        assert [Path(out).name for out in ended.out] == [
+            f"{name}.{kind}" for name in NAMES[1:] for kind in ("png", "svg")
+        ]
+        assert {p.stem for p in (mine / "figures").iterdir()} == set(NAMES[1:])
 
     @pytest.mark.parametrize(
         ("options", "said"),
@@ -305,15 +309,15 @@ class TestCommand:
         ended = call(mine, "--out", mine / "summary.csv")
         assert ended.code == 2
         assert ended.lines[0].endswith("expected a folder, found a file; choose another with --out")
-        write = Figure.savefig
+        write = Path.write_bytes
 
-        def full(figure: Figure, path: Path, **more: Any) -> None:
+        def full(path: Path, content: bytes) -> int:
             if path.name == "curves.svg":
                 path.write_text("half")
                 raise OSError(28, "No space left on device")
-            write(figure, path, **more)
+            return write(path, content)
 
-        monkeypatch.setattr(Figure, "savefig", full)
+        monkeypatch.setattr(Path, "write_bytes", full)
         ended = call(mine, "--out", tmp_path / "new")
         assert (ended.code, ended.out) == (2, [])
         assert ended.lines == [f"{tmp_path}/new: cannot be written: No space left on device; choose another with --out"]
@@ -612,11 +616,52 @@ class TestSweeps:
         assert [Path(out).name for out in ended.out[-2:]] == ["sweeps.png", "sweeps.svg"]
         ended = call(swept.folder, "--configurations", "never")
         assert (ended.code, len(ended.out)) == (0, 6)
-        assert ended.lines == [f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never"]
+        assert ended.lines == [
+            "note: no figure of latency_breakdown: nothing was detected",
+            f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never",
+        ]
 
     def test_none(self, results: Results) -> None:
         with pytest.raises(InputError, match=r"expected sweep\.csv in it, found none"):
             sweeps_figure(results)
+
+
+class TestOneByOne:
+    def test_a_panel_each_with_the_same_curve_and_its_band(self, results: Results) -> None:
+        together = curves_figure(results).axes[0]
+        figure = one_by_one_figure(results)
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        names = tuple(results.experiment.configurations)
+        assert [axes.get_title(loc="left").partition(":")[0] for axes in shown] == list(names)
+        for axes, name in zip(shown, names, strict=True):
+            for found, expected in zip(line(axes, name), line(together, name), strict=True):
+                np.testing.assert_array_equal(found, expected)
+            assert line(axes, "first")[1].tolist() == line(together, "GT")[1].tolist()
+        assert [axes.get_xlabel() for axes in shown] == ["", "", *["Time since the onset (s)"] * 3]
+
+    def test_only_where_bands_would_hide_each_other(
+        self, results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("copem_replay.report.figures.registry.MOST_BANDS", 3)
+        names = ["GT", "late", "near", "hit"]
+        files, _ = write_figures(results, tmp_path / "four", configurations=names)
+        assert "one_by_one.svg" in {path.name for path in files}
+        files, _ = write_figures(results, tmp_path / "three", configurations=names[:3])
+        assert "one_by_one.svg" not in {path.name for path in files}
+
+
+class TestLatencyBreakdown:
+    def test_bars_add_up_to_the_mean_time_of_what_is_detected(self, results: Results) -> None:
+        (axes,) = latency_breakdown_figure(results).axes
+        names = list(results.experiment.configurations)
+        assert [tick.get_text() for tick in axes.get_yticklabels()] == names
+        bars = [bar for group in axes.containers if group.get_label() != "_edge" for bar in group.patches]
+        for k, name in enumerate(names):
+            rows = results.table[(results.table["configuration"] == name) & results.table["detected"]]
+            mine = [bar for bar in bars if bar.get_y() < k < bar.get_y() + bar.get_height()]
+            spent_s = rows["detection_s"] - rows["onset_s"]
+            assert sum(bar.get_width() for bar in mine) == pytest.approx(spent_s.mean() if len(rows) else 0.0)
+        assert "never known" in [text.get_text().strip() for text in axes.texts]
 
 
 class TestWords:
@@ -636,7 +681,7 @@ class TestWords:
         text = changed("runs: 1").replace("  late:", '  "$a$_{<&>}":').replace("  hit:", '  "_試":')
         results = load_results(replayed(tmp_path, text))
         files, notes = write_figures(results)
-        assert (len(files), notes) == (6, [])
+        assert (len(files), notes) == (8, [])
         labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
 

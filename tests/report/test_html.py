@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-import plotly.graph_objects as go
 import pytest
+from matplotlib.figure import Figure
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.metrics.summary_text import summary_text
 from copem_replay.report import write_report
-from copem_replay.report.figures import load_results
-from copem_replay.report.figures.style import appearances
-from copem_replay.report.html.latency_breakdown import (
+from copem_replay.report.figures import FIGURES, FigureKind, Selection, load_results, write_figures
+from copem_replay.report.figures.latency_breakdown import (
     FUSION,
     HIDDEN,
     IN_SIGHT,
@@ -32,12 +31,13 @@ from copem_replay.report.html.latency_breakdown import (
     UNTIL_CAPTURED,
     stages,
 )
+from copem_replay.report.figures.style import new_figure, style
 from copem_replay.report.html.markup import Html, tag
 from copem_replay.report.html.missed_objects import misses, powers
 from copem_replay.report.html.page import page
-from copem_replay.report.html.plotly_figures import rgb
 from copem_replay.report.html.study import load_study
 from copem_replay.results.compare import compare, comparison_text
+from copem_replay.results.read import Results
 from tests.helpers.report_pages import ALONE, EVERY, ONE, Page, changed, drive, replayed
 
 NAMES = ("GT", "late", "half", "hit", "never")
@@ -307,7 +307,7 @@ class TestWords:
             "Nothing was detected: no configuration came to know of any measured object in any run."
         )
         assert not any("soonest" in line or "shortest" in line for line in found.lines())
-        assert "No waterfall: nothing was detected." in found.words
+        assert "No figure: nothing was detected." in found.words
         assert found.rows["never"][1][:5] == ["drive", "2", "pedestrian", "6 runs (all)", "all 3 configurations"]
 
     def test_nobody_measured_is_no_answer(self, tmp_path: Path) -> None:
@@ -316,7 +316,7 @@ class TestWords:
         assert found.lines()[2] == "There is no answer: no measured object has an onset, so nobody was measured."
         assert any(line.startswith("drive: no rows: nothing to measure") for line in found.lines())
         assert "No differences: nobody was measured." in found.words
-        assert json.loads(found.data) == []
+        assert found.plots == []
         assert next(cell.text for cell in found.tables["summary"]["GT"].values()) == "0"
 
     def test_the_baseline_is_ideal_else_the_first_else_as_asked(self, made: Path, tmp_path: Path) -> None:
@@ -455,67 +455,76 @@ class TestWaterfall:
     def test_with_count_earlier_there_is_none(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
         found = Page(page(load_study(folder)))
-        assert "No waterfall: with count_earlier" in found.words
-        assert "waterfall" not in {figure["id"] for figure in json.loads(found.data)}
+        assert "No figure: with count_earlier" in found.words
+        assert found.plots == ["curves", "distances"]
 
 
 class TestFigures:
-    def test_plotly_knows_all_that_is_asked_of_it(self, read: Page) -> None:
-        figures = json.loads(read.data)
-        places = [found["id"] for name, found in read.elements if name == "div" and found.get("class") == "plot"]
-        assert places == [figure["id"] for figure in figures]
-        for figure in figures:
-            go.Figure(data=figure["data"], layout=figure["layout"])  # raises where it does not know a key or value
-        assert len(places) == 1 + 5 + 5 + 1, "curves together and one by one, distances, waterfall"
+    def test_each_that_needs_no_recording(self, read: Page, tmp_path: Path) -> None:
+        assert read.plots == ["curves", "distances", "latency_breakdown"]
+        text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
+        assert Page(page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
 
-    def test_curves_are_those_of_the_rows(self, read: Page) -> None:
-        curves = next(figure for figure in json.loads(read.data) if figure["id"] == "curves")
-        late = [trace for trace in curves["data"] if trace["meta"] == 1][-1]
-        assert list(zip(late["x"], late["y"], strict=True))[1:-1] == [(0.5, 1.0)]
-        never = [trace for trace in curves["data"] if trace["meta"] == 4][-1]
-        assert set(never["y"]) == {0.0}
-        colours = [trace["line"]["color"] for trace in curves["data"]]
-        for name, look in appearances(NAMES).items():
-            assert rgb(look.colour) in colours, name
+    def test_they_are_those_of_plot(self, made: Path, html: str, tmp_path: Path) -> None:
+        """Shape by shape: the paths of each SVG file, in their order, are in the page."""
+        files, _ = write_figures(load_results(made), tmp_path)
+        shapes = re.findall(r' d="([^"]*)"', html)
+        for name in ("curves", "distances", "latency_breakdown"):
+            (file,) = (file for file in files if file.name == f"{name}.svg")
+            drawn = re.findall(r' d="([^"]*)"', file.read_text(encoding="utf-8"))
+            first = next(k for k in range(len(shapes)) if shapes[k : k + len(drawn)] == drawn)
+            assert len(drawn) > 50, name
+            del shapes[first : first + len(drawn)]
 
-    def test_distances_count_every_row_once(self, read: Page) -> None:
-        figures = {figure["id"]: figure for figure in json.loads(read.data)}
-        for k, name in enumerate(NAMES):
-            bars = [trace for trace in figures[f"distances-{k}"]["data"] if trace["type"] == "bar"]
-            shown = {trace["name"]: sum(trace["y"]) for trace in bars}
-            expected = {"hit": {"fails": 1.0}, "never": {}}.get(name, {"passes": 1.0})
-            assert {kind: pytest.approx(share, abs=1e-5) for kind, share in expected.items()} == shown, name
-        (late,) = [trace for trace in figures["distances-1"]["data"] if trace["type"] == "bar"]
-        low, high = late["customdata"][0]
-        assert low <= 20 < high, "known at 1.0 s, when the ego is at 10 m and the pedestrian at 30 m"
-        assert figures["distances-1"]["layout"]["shapes"][0]["x0"] == pytest.approx(20)
-        assert figures["distances-4"]["layout"]["shapes"] == []
+    def test_one_of_ones_own_is_in_plot_and_report(
+        self, mine: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        def rows(results: Results, of: Selection) -> Figure:
+            with style():
+                figure = new_figure(3.0, 2.0)
+                figure.subplots().bar(results.chosen(of.configurations), 1.0)
+            return figure
 
-    def test_a_foreseen_collision_has_figures_and_verdicts_of_its_own(self, tmp_path: Path) -> None:
+        about = ("Of each configuration a bar.",)
+        own = FigureKind("How many", "a bar per configuration", rows, about=lambda results: about)
+        monkeypatch.setitem(FIGURES, "how_many", own)
+        files, notes = write_figures(load_results(mine), tmp_path / "figures")
+        assert [file.name for file in files[-2:]] == ["how_many.png", "how_many.svg"]
+        assert notes == []
+        found = Page(page(load_study(mine)))
+        assert found.plots[-1] == "how_many"
+        assert "How many\nOf each configuration a bar.\n" in found.words
+        monkeypatch.setitem(FIGURES, "how_many", replace(own, missing=lambda results, of: "there are none"))
+        assert "No figure: there are none." in Page(page(load_study(mine))).words
+        _, notes = write_figures(load_results(mine), tmp_path / "figures")
+        assert notes == ["no figure of how_many: there are none"]
+        assert not list((tmp_path / "figures").glob("how_many*"))
+
+    def test_ids_are_of_one_figure(self, read: Page) -> None:
+        ids = [given["id"] for _, given in read.elements + read.drawn if given.get("id")]
+        drawn = [id_ for id_ in ids if id_ and id_.startswith(("curves-", "distances-", "latency_breakdown-"))]
+        assert len(drawn) > 30
+        assert len(set(ids)) == len(ids)
+        known = {f"#{id_}" for id_ in ids}
+        used = {given["xlink:href"] for _, given in read.elements + read.drawn if "xlink:href" in given}
+        clips = {clip[4:-1] for _, given in read.elements + read.drawn if (clip := given.get("clip-path"))}
+        assert used | clips <= known
+
+    def test_what_is_of_a_configuration_is_marked(self, read: Page) -> None:
+        ids = [given["id"] or "" for _, given in read.elements + read.drawn if "id" in given]
+        for name in ("curves", "distances", "latency_breakdown"):
+            numbers = {id_.split("-")[2] for id_ in ids if id_.startswith(f"{name}-configuration-")}
+            assert numbers == {"0", "1", "2", "3", "4"}, name
+
+    def test_a_foreseen_collision_is_said(self, tmp_path: Path) -> None:
         text = changed(ONE, *ALONE[2:], ("time_s: 0.5}}", "time_s: 0.5}, conflict: {horizon_s: 2.0}}"))
         text = text.replace("braking: {", "braking: {brakes_for: conflict, ")
         found = Page(page(load_study(replayed(tmp_path, text))))
-        figures = {figure["id"]: figure for figure in json.loads(found.data)}
-
-        def bars(id_: str) -> set[str]:
-            return {trace["name"] for trace in figures[id_]["data"] if trace["type"] == "bar"}
-
-        assert bars("distances-1") == {"not in conflict"}, "who brakes for the one is not judged at the other"
-        assert bars("foreseen-1") <= {"passes", "fails"}
-        assert bars("foreseen-1")
         assert "Distance when the collision is foreseen" in found.words
         assert list(found.tables["conflict"]) == ["GT", "late", "half"]
 
-    def test_sweeps_have_a_figure_each(self, tmp_path: Path) -> None:
-        text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
-        found = Page(page(load_study(replayed(tmp_path, text))))
-        figures = [figure for figure in json.loads(found.data) if figure["id"].startswith("sweep-")]
-        titles = [figure["layout"]["xaxis"]["title"]["text"] for figure in figures]
-        assert titles == ["Latency (s)"] * 3 + ["Rate of the units (lists per second)"] * 3
-        shown = [{trace["name"] for trace in figure["data"]} for figure in figures]
-        assert shown == [{"late (latency swept)"}] * 3 + [{"late", "half"}] * 3, "half has no latency to vary"
-        for figure in figures:
-            go.Figure(data=figure["data"], layout=figure["layout"])
+    def test_the_page_is_small(self, html: str) -> None:
+        assert len(html.encode()) < 1_500_000
 
 
 class TestFile:
@@ -531,10 +540,12 @@ class TestFile:
         assert str(tmp_path).encode() not in deep.read_bytes()
 
     def test_nothing_is_fetched(self, read: Page) -> None:
-        for name, found in read.elements:
+        for name, found in read.elements + read.drawn:
             assert name not in ("img", "iframe", "object", "embed", "base", "form"), name
             for key, value in found.items():
-                assert key not in ("src", "srcset", "action", "style"), (name, key)
+                assert key not in ("src", "srcset", "action"), (name, key)
+                assert key != "style" or "url(" not in (value or "").replace("url(#", ""), (name, value)
+                assert key != "xlink:href" or (value or "").startswith("#"), (name, value)
                 assert not key.startswith("on"), (name, key)
                 assert key != "href" or value == "data:,", (name, value)
         (policy,) = [found["content"] for _, found in read.elements if found.get("http-equiv")]
@@ -558,9 +569,7 @@ class TestFile:
         assert name in found.tables["summary"]
         assert found.rows["logs"][1][0] == log.removesuffix(".mcap")
         assert "<b>ego" in found.words
-        drawn = json.loads(found.data)
-        assert any(trace.get("name") == "&lt;img src=x onerror=alert(1)&gt;\"'&amp;amp;" for trace in drawn[0]["data"])
-        assert "<" not in found.data
+        assert html.count("onerror") == html.count("&lt;img src=x onerror=alert(1)&gt;")
 
     def test_elements_escape_all_but_html(self) -> None:
         made = tag("td", "a<b>&\"'", Html("<i></i>"), class_='x"y', data_value=None, hidden=True)

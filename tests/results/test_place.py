@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -436,7 +437,7 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
     old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     """Results that are replaced while figures are drawn, or a page is made."""
-    from copem_replay.report.figures import write as figures
+    from copem_replay.report.figures import FIGURES
     from copem_replay.report.html import page
 
     def meanwhile(original: Callable[..., Any]) -> Callable[..., Any]:
@@ -446,7 +447,7 @@ def test_what_is_made_of_old_results_does_not_get_among_new_ones(
 
         return replaced
 
-    monkeypatch.setattr(figures, "curves_figure", meanwhile(figures.curves_figure))
+    monkeypatch.setitem(FIGURES, "curves", replace(FIGURES["curves"], draw=meanwhile(FIGURES["curves"].draw)))
     monkeypatch.setattr(page, "page", meanwhile(page.page))
     ended = call(command, "out/e")
     assert ended.code == 2

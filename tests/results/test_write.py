@@ -23,6 +23,7 @@ from copem_replay.pipeline import blocks as blocks_module
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
+from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS
 from tests.helpers import scenes
@@ -350,3 +351,22 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
             for cut_up in (in_sevens, run(many, [log])):
                 assert cut_up.table.equals(whole.table)
                 assert cut_up.summary.equals(whole.summary)
+
+
+def test_what_is_shown_is_written_by_the_exporters_that_are_passed(two_logs: list[Path], tmp_path: Path) -> None:
+    def write(path: Path, exported: RunToExport) -> list[str]:
+        assert exported.recording.scene.log == exported.manifest["log"]
+        path.write_text(f"{exported.shown.run} {sorted(set(exported.table['configuration']))}")
+        return ["half as long as it was"]
+
+    chosen = plan(show={"logs": ["all"], "run": 1}, configurations={"GT": {"units": "truth"}})
+    recordings, _ = read_logs(chosen, two_logs, None)
+    result = run(chosen, recordings)
+    notes = write_results(tmp_path / "own", chosen, recordings, result, exporters=[Exporter(".txt", write)])
+    shown = {path.relative_to(tmp_path / "own").as_posix() for path in (tmp_path / "own").rglob("replay/**/*.*")}
+    assert shown == {"replay/near/drive.txt", "replay/far/drive.txt"}
+    assert {(tmp_path / "own" / name).read_text() for name in shown} == {"1 ['GT']"}
+    assert {"near/drive: half as long as it was", "far/drive: half as long as it was"} <= set(notes)
+    assert shown <= set(json.loads((tmp_path / "own/provenance.json").read_text())["files"])
+    write_results(tmp_path / "none", chosen, recordings, result, exporters=[])
+    assert not (tmp_path / "none" / "replay").exists()

@@ -301,7 +301,7 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     from dataclasses import replace
 
     from copem_replay.viewer.line_of_sight import sight
-    from copem_replay.viewer.status import LOST, UNMATCHED, VISIBLE, status_of
+    from copem_replay.viewer.status import LOST, UNMATCHED, VISIBLE, clock_of, status_of
 
     belief, number = hiding.beliefs["both"], hiding.replay.scene.object_number["4"]
     heard = belief.heard
@@ -311,7 +311,8 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
         heard = replace(heard, arrives_s=np.full_like(heard.arrives_s, np.inf))
     nothing = replace(belief.fused, valid=np.zeros_like(belief.fused.valid))
     seen = sight(hiding.replay, hiding.given, [number])
-    made = status_of(hiding.replay, hiding.given, "both", replace(belief, heard=heard, fused=nothing), seen)
+    clock = clock_of(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
+    made = status_of(hiding.replay, hiding.given, "both", replace(belief, heard=heard, fused=nothing), seen, clock)
     early = made.elapsed_ns < 199_000_000
     assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}
     assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[VISIBLE]}

@@ -79,13 +79,7 @@ def write_mcap(
         begun = lists_of(first)  # registers the channels
         del first
         added = chain.from_iterable(_in_order(streams) for streams in chain([begun], (lists_of(c) for c in rest)))
-        units_record = {f"unit.{number}": unit for unit, number in numbers.items()}
-        for name, record in _kept(original).items():
-            if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
-                writer.add_metadata(name, record)
-        writer.add_metadata(RUN_RECORD, dict(sorted({**manifest, **units_record}.items())))
-        if family.osi:
-            writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
+        _add_records(writer, original, family, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for message in _in_order([messages, added]):
             writer.add_message(
                 message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
@@ -93,6 +87,16 @@ def write_mcap(
     replaced = sorted(ours & {channel.topic for channel in original.channels.values()})
     notes = [f"{len(replaced)} topics of an earlier replay are replaced ({replaced[0]} …)"] if replaced else []
     return [*([original.damage] if original.damage else []), *notes]
+
+
+def _add_records(writer: Writer, original: Source, family: Family, manifest: Mapping[str, str]) -> None:
+    """The input's metadata records, and those of this file."""
+    for name, record in _kept(original).items():
+        if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
+            writer.add_metadata(name, record)
+    writer.add_metadata(RUN_RECORD, dict(sorted(manifest.items())))
+    if family.osi:
+        writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
 
 
 def _lists_of(

@@ -5,23 +5,33 @@
 | `runs_figure` | one run in up to four configurations: speed, distance, visible share, and what happened when |
 | `distances_figure` | distance at detection of every row, a strip per configuration, pass and fail told apart |
 | `curves_figure` | share detected over the time since the onset, with 95 % bands |
+| `one_by_one_figure` | the same, a panel with its band per configuration |
+| `latency_breakdown_figure` | mean duration of the stages from the onset to the detection |
 | `sweeps_figure` | shares and times over what was swept, where the folder has a `sweep.csv` |
 
-`write_figures` makes the files. Nothing of matplotlib is imported before a figure is asked for, and pyplot never is.
+They are the rows of `FIGURES` (`registry.py`); `write_figures` makes the files. Nothing of matplotlib is
+imported before a figure is asked for, and pyplot never is.
 """
 
-from copem_replay.report.figures.detection_curves import curves_figure
+from copem_replay.report.figures.detection_curves import curves_figure, one_by_one_figure
 from copem_replay.report.figures.distances import distances_figure
+from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
+from copem_replay.report.figures.registry import FIGURES, FigureKind, Selection
 from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.write import write_figures
 from copem_replay.results.read import Results, load_results
 
 __all__ = [
+    "FIGURES",
+    "FigureKind",
     "Results",
+    "Selection",
     "curves_figure",
     "distances_figure",
+    "latency_breakdown_figure",
     "load_results",
+    "one_by_one_figure",
     "runs_figure",
     "sweeps_figure",
     "write_figures",

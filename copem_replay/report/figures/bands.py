@@ -1,8 +1,9 @@
 """Bands around curves of detection: 95 % by drawing whole clusters of rows with replacement.
 
 Clusters are what hangs together: the runs of the one measured object; else logs, or objects, where there are at least
-five; with fewer there is no band. Limits are, instant by instant, those of a share in `summary.csv` (metrics/intervals.py):
-every configuration resamples the same clusters. Letters: n rows, K clusters, R resamples, G instants.
+five; with fewer there is no band. Limits are, instant by instant, those of a share in `summary.csv`
+(metrics/intervals.py): every configuration resamples the same clusters. Letters: n rows, K clusters, R resamples, G
+instants.
 """
 
 from __future__ import annotations

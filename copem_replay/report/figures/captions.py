@@ -25,14 +25,14 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def study(results: Results, names: Sequence[str]) -> str:
-    """Which results these are, and how many rows each configuration has."""
+    """Which results these are, wherever they lie, and how many rows each configuration has."""
     table = results.table[results.table["configuration"].isin(list(names))]
     things = table.groupby(["log", "object_id"]).ngroups
     logs = table["log"].nunique()
     where = f" in {counted(logs, 'log')}" if logs > 1 else ""
     rows = len(table) / max(table["configuration"].nunique(), 1)
     return (
-        f"{results.name}: {counted(results.experiment.runs, 'run')} of {counted(things, 'object')}{where}, "
+        f"{counted(results.experiment.runs, 'run')} of {counted(things, 'object')}{where}, "
         f"n = {rows:.0f} per configuration, seed {results.experiment.seed}"
     )
 

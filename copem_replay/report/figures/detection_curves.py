@@ -1,7 +1,7 @@
 """The figure of curves: which share of the objects is detected by when, configuration by configuration.
 
-The curves are cumulative incidences of detection (Aalen–Johansen, departure competing: metrics/survival.py), so that what is
-never detected keeps them below 100 %.
+The curves are cumulative incidences of detection (Aalen–Johansen, departure competing:
+metrics/survival.py), so that what is never detected keeps them below 100 %.
 """
 
 from __future__ import annotations
@@ -20,8 +20,16 @@ from copem_replay.metrics.fixed import NOTHING_DRAWN, fixed_in
 from copem_replay.metrics.summary import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.report.figures.bands import band
-from copem_replay.report.figures.captions import list_rates, short_names, study
-from copem_replay.report.figures.style import add_note, appearances, new_figure, style
+from copem_replay.report.figures.captions import list_rates, percent, short_names, study
+from copem_replay.report.figures.style import (
+    FAINT,
+    Appearance,
+    add_note,
+    appearances,
+    new_figure,
+    of_configuration,
+    style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,6 +41,9 @@ _NEARLY = 0.005
 """The axis ends when each curve has come this near to its last value (chosen)."""
 MOST_BANDS = 6
 """More bands than this hide each other (chosen)."""
+_COLUMNS = 3
+"""Panels side by side where each configuration has one (chosen)."""
+_EXACT: dict[str, Any] = {"color": "black", "linewidth": 0.7, "linestyle": (0, (5, 3))}
 _INSTANTS = 600
 """At which a band is drawn, at most (chosen: a few per pixel's width)."""
 
@@ -126,24 +137,16 @@ def _drawn(results: Results, curves: dict[str, Curve], exact: dict[str, Curve]) 
     figure = new_figure(8.0, 4.5)
     axes = figure.subplots()
     handles: list[Any] = []
+    numbers = {name: k for k, name in enumerate(looks)}
     for name, curve in curves.items():
-        look = looks[name]
-        if curve.low is not None and curve.high is not None:
-            x, low, high = (_steps(curve.times_s, values, begin_s, end_s) for values in (None, curve.low, curve.high))
-            axes.fill_between(
-                x, low, high, step="post", color=look.colour, alpha=0.2, linewidth=0, zorder=1, label=f"band of {name}"
-            )
-            for limit in (low, high):
-                axes.step(x, limit, where="post", color=look.edge, linewidth=0.5, alpha=0.7, zorder=1.1)
-        handles += _step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **look.line())
-    for k, curve in enumerate(exact.values()):
-        drawn = _step(
-            axes, curve, begin_s, end_s, label="exact", zorder=3, color="black", linewidth=0.7, linestyle=(0, (5, 3))
-        )
+        with of_configuration(numbers[name], axes):
+            _band(axes, curve, name, looks[name], begin_s, end_s)
+            handles += _step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **looks[name].line())
+    for k, (name, curve) in enumerate(exact.items()):
+        with of_configuration(numbers[name], axes):
+            drawn = _step(axes, curve, begin_s, end_s, label="exact", zorder=3, **_EXACT)
         handles += drawn if k == 0 else []
-    axes.set_xlim(begin_s, end_s)
-    axes.set_ylim(-0.02, 1.03)
-    axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
+    _axes(axes, begin_s, end_s)
     axes.set_xlabel("Time since the onset (s)")
     axes.set_ylabel("Share detected by then")
     figure.legend(
@@ -153,6 +156,52 @@ def _drawn(results: Results, curves: dict[str, Curve], exact: dict[str, Curve]) 
         handlelength=3.6,
     )
     return figure
+
+
+def one_by_one_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
+    """The same curves, each with its band in a panel of its own; thin: that of the first configuration."""
+    names = results.chosen(configurations)
+    over, curves = curves_of(results, names)
+    looks, short = appearances(tuple(results.experiment.configurations)), short_names(names)
+    begin_s, end_s = time_axis(list(curves.values()))
+    rows = math.ceil(len(names) / _COLUMNS)
+    with style():
+        figure = new_figure(8.0, 0.6 + 1.9 * rows)
+        panels = figure.subplots(rows, _COLUMNS, sharex=True, sharey=True, squeeze=False)
+        for axes, name in zip(panels.flat, names, strict=False):
+            with of_configuration(list(looks).index(name), axes):
+                _step(axes, curves[names[0]], begin_s, end_s, label="first", color=FAINT, linewidth=0.9)
+                _band(axes, curves[name], name, looks[name], begin_s, end_s)
+                _step(axes, curves[name], begin_s, end_s, label=name, zorder=2.2, **looks[name].line(1.8))
+            axes.set_title(f"{short[name]}: {percent(curves[name].last)}", loc="left")
+            _axes(axes, begin_s, end_s)
+        for axes in panels.flat[len(names) :]:
+            axes.set_visible(False)
+        for axes in panels.flat[max(len(names) - _COLUMNS, 0) : len(names)]:  # of each column the last
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("Time since the onset (s)")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("Detected by then")
+        bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
+        add_note(figure, [study(results, names), f"Thin: {short[names[0]]}", bands if over else "No bands"])
+    return figure
+
+
+def _axes(axes: Axes, begin_s: float, end_s: float) -> None:
+    axes.set_xlim(begin_s, end_s)
+    axes.set_ylim(-0.02, 1.03)
+    axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
+
+
+def _band(axes: Axes, curve: Curve, name: str, look: Appearance, begin_s: float, end_s: float) -> None:
+    if curve.low is None or curve.high is None:
+        return
+    x, low, high = (_steps(curve.times_s, values, begin_s, end_s) for values in (None, curve.low, curve.high))
+    axes.fill_between(
+        x, low, high, step="post", color=look.colour, alpha=0.2, linewidth=0, zorder=1, label=f"band of {name}"
+    )
+    for limit in (low, high):
+        axes.step(x, limit, where="post", color=look.edge, linewidth=0.5, alpha=0.7, zorder=1.1)
 
 
 def time_axis(curves: Sequence[Curve]) -> tuple[float, float]:

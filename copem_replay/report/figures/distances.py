@@ -15,7 +15,15 @@ import pandas as pd
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.report.figures.captions import list_rates, percent, short_names, study
-from copem_replay.report.figures.style import INK, Appearance, add_note, appearances, new_figure, style
+from copem_replay.report.figures.style import (
+    INK,
+    Appearance,
+    add_note,
+    appearances,
+    new_figure,
+    of_configuration,
+    style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,6 +76,25 @@ def distances_figure(results: Results, *, configurations: Sequence[str] | None =
     return figure
 
 
+def distances_about(results: Results) -> list[str]:
+    """Paragraphs on what is drawn."""
+    braking = results.experiment.braking
+    about = [
+        "How far apart the centres of object and reference are in truth at the instant of detection, every row a "
+        "point. Farther is earlier only while the two approach each other."
+    ]
+    if _CONFLICT in results.table:
+        about.append("Distance when the collision is foreseen: the same at the first list that implies a collision.")
+    if braking is not None:
+        what = "the detection" if braking.brakes_for == "object" else "the list that implies a collision"
+        about.append(
+            f"A row passes if the ego, braking as its declared driver does after {what}, stays more than "
+            f"{braking.margin_m:g} m away. Rows without detection have no point, but are judged like all others in "
+            "conflict: the share that passes counts them."
+        )
+    return about
+
+
 def verdicts(table: pd.DataFrame) -> pd.Series:
     """Of each row (n,): PASS, FAIL, or NEUTRAL where there is no conflict to judge."""
     if "conflict" not in table:
@@ -107,9 +134,10 @@ def _panel(
         # Who brakes for the one event has nothing to show at the distance of the other.
         kind = verdicts(rows).to_numpy() if judged else np.full(len(rows), NEUTRAL, dtype=object)
         across = k - _HALF * spread(distance_m[placed], list(kind[placed]), top_m / _BINS)
-        _points(axes, distance_m[placed], across, kind[placed], looks[name], name, len(table), judged)
         never = int((~known).sum())
-        axes.text(-0.07 * top_m, k, f"{never}", ha="center", va="center_baseline", color=INK if never else "0.6")
+        with of_configuration(list(looks).index(name), axes):
+            _points(axes, distance_m[placed], across, kind[placed], looks[name], name, len(table), judged)
+            axes.text(-0.07 * top_m, k, f"{never}", ha="center", va="center_baseline", color=INK if never else "0.6")
     axes.axvspan(-0.14 * top_m, 0, color="0.95", zorder=0)
     axes.text(-0.07 * top_m, -0.62, _NEVER[column], ha="center", va="bottom", fontsize=7, color="0.3")
     axes.set_xlim(-0.14 * top_m, 1.04 * top_m)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from copem_replay.core.colours import configuration_colours
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Colour = tuple[float, float, float]
@@ -131,6 +132,17 @@ def style() -> Iterator[None]:
         for name, value in _STYLE.items():
             matplotlib.rcParams[name] = value  # type: ignore[index]
         yield
+
+
+@contextmanager
+def of_configuration(number: int, *panels: Axes) -> Iterator[None]:
+    """Mark what is drawn into panels meanwhile as that of a configuration: a page of HTML can then hide it."""
+    before = {id(artist) for axes in panels for artist in axes.get_children()}
+    yield
+    drawn = [artist for axes in panels for artist in axes.get_children() if id(artist) not in before]
+    marked = len(panels[0].get_figure(root=True).findobj(lambda artist: bool(artist.get_gid())))  # type: ignore[union-attr]
+    for place, artist in enumerate(drawn, start=marked):
+        artist.set_gid(f"configuration-{number}-{place}")
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -15,7 +15,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.text import interval_words
 from copem_replay.core.tracks import Float
 from copem_replay.report.figures.captions import list_rates, short_names
-from copem_replay.report.figures.style import Appearance, add_note, appearances, new_figure, style
+from copem_replay.report.figures.style import Appearance, add_note, appearances, new_figure, of_configuration, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +60,8 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
                 for name in wanted:
                     mine = part[part["configuration"] == name].sort_values("value", kind="stable")
                     if len(mine):
-                        _series(axes, mine, row, name, looks[name])
+                        with of_configuration(list(looks).index(name), axes):
+                            _series(axes, mine, row, name, looks[name])
             _value_axis(column[-1], kind, part)
         for axes, row in zip(panels[:, 0], rows, strict=True):
             axes.set_ylabel(_ROWS[row])
@@ -164,7 +165,7 @@ def _interval_kinds(sweep: pd.DataFrame) -> list[str]:
 def _note(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
     n = sorted({int(value) for value in sweep["n"].dropna()}) if "n" in sweep else []
     rows = f", n = {n[0] if n[0] == n[-1] else f'{n[0]} to {n[-1]}'} per point" if n else ""
-    said = [f"{results.name}: sweeps, {results.experiment.runs} runs{rows}, seed {results.experiment.seed}"]
+    said = [f"Sweeps, {results.experiment.runs} runs{rows}, seed {results.experiment.seed}"]
     for kind in kinds:
         if kind != "rate_hz":
             rates = list_rates(sweep[sweep["sweep"] == kind], names)

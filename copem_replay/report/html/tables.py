@@ -13,7 +13,7 @@ import pandas as pd
 
 from copem_replay.metrics.summary_text import cell, intervals_said
 from copem_replay.report.html.markup import Html, breakable, joined, listed, table, tag
-from copem_replay.report.html.plotly_figures import swatch
+from copem_replay.report.html.swatches import swatch
 from copem_replay.results.compare.metrics import METRICS
 from copem_replay.results.compare.tables import comparison_lines, plain, signed, without_interval
 

@@ -1,0 +1,161 @@
+"""The figure of stages: where the time from the clock's start to the detection goes.
+
+| stage | from | to |
+|---|---|---|
+| hidden | the onset | the first list of any of the configuration's units in which it is in sight (`in_sight_s`) |
+| in sight | there | the newest capture that contributed to knowing (`captured_s`) |
+| transport | there | the arrival of that list: captured plus latency |
+| fusion | there | the fused list with which it was known (`detection_s`) |
+
+Means over the rows that were detected, so that stages add up. An object listed while nobody had it in sight was hidden
+until it was listed. Of a confirmation only the newest capture is known: what it takes is spent *in sight*, as is the
+time in which another unit's list of the object is still on its way. Ideal fusion and the truth know from the list that
+brings it (one hit): all from its capture on is transport, nothing fusion. Otherwise transport is the latency, where all
+units have the same; else the two stages are one. So are the first two where it is not known when it was in sight: the
+truth needs no sight, and recorded units don't tell. With `count_earlier` times may be negative, and nothing is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.tracks import Float
+from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.receiver import by_truth
+from copem_replay.report.figures.captions import percent, short_names, study
+from copem_replay.report.figures.style import add_note, appearances, new_figure, of_configuration, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
+
+HIDDEN, IN_SIGHT, UNTIL_CAPTURED = "hidden", "in sight", "until captured"
+TRANSPORT, FUSION, SINCE_CAPTURED = "transport", "fusion", "since captured"
+STAGES = {
+    HIDDEN: "from the start of the clock until any of the configuration's units has it in sight in a list it makes",
+    IN_SIGHT: "from there until the capture of the newest list that contributed to knowing it: out of range, missed by "
+    "the perception, between two lists, not yet confirmed, or listed by a unit whose list was still on its way",
+    UNTIL_CAPTURED: "from the start of the clock until that capture, where it is not known when the object was in "
+    "sight: the truth needs no sight, and recorded units do not tell",
+    TRANSPORT: "the latency of that list: making the message and sending it, of which the experiment says one number",
+    FUSION: "from its arrival until the fused list with which the object was known",
+    SINCE_CAPTURED: "from that capture until then, where it is not known how much of it is transport: units have "
+    "different latencies, or recorded ones",
+}
+HATCHES = {
+    HIDDEN: ("#d9d9d9", "", "black"),
+    IN_SIGHT: ("#8c8c8c", "///", "white"),
+    UNTIL_CAPTURED: ("white", "///", "#8c8c8c"),
+    TRANSPORT: ("#404040", "", "black"),
+    FUSION: ("white", "...", "black"),
+    SINCE_CAPTURED: ("#6e6e6e", "xxx", "white"),
+}
+"""Of each stage its fill, and the hatch on it with its colour."""
+
+
+def stages_of(results: Results, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """By configuration the mean seconds of each stage."""
+    table = results.table
+    return {name: stages(table[table["configuration"] == name], results.experiment, name) for name in names}
+
+
+def no_stages(results: Results, names: Sequence[str]) -> str | None:
+    """The reason why nothing can be drawn; None: it can."""
+    if results.experiment.measure.count_earlier:
+        return "with count_earlier an object may be known before the clock starts"
+    return None if any(stages_of(results, names).values()) else "nothing was detected"
+
+
+def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
+    """Mean duration of the stages from the onset to the detection, a bar per configuration."""
+    names = results.chosen(configurations)
+    means = stages_of(results, names)
+    looks, short = appearances(tuple(results.experiment.configurations)), short_names(names)
+    with style():
+        figure = new_figure(8.0, 1.3 + 0.3 * len(names))
+        axes = figure.subplots()
+        longest_s = max(sum(of.values()) for of in means.values())
+        for k, name in enumerate(names):
+            with of_configuration(list(looks).index(name), axes):
+                _bar(axes, k, means[name], looks[name].colour)
+                rows = results.table[results.table["configuration"] == name]
+                said = _beside(sum(means[name].values()), int(rows["detected"].sum()), len(rows))
+                axes.text(sum(means[name].values()) + 0.008 * longest_s, k, said, va="center_baseline")
+        axes.set_yticks(range(len(names)), [short[name] for name in names])
+        axes.tick_params(axis="y", length=0, pad=10)
+        axes.set_ylim(len(names) - 0.4, -0.6)
+        axes.set_xlim(0, 1.3 * longest_s or 1.0)
+        axes.grid(visible=False, axis="y")
+        axes.set_xlabel("Mean time (s)")
+        _legend(figure, [stage for stage in STAGES if any(stage in of for of in means.values())])
+        add_note(figure, [study(results, names), "Means over the rows that are detected"])
+    return figure
+
+
+def _bar(axes: Axes, place: int, means: dict[str, float], colour: tuple[float, float, float]) -> None:
+    """The stages of one configuration one after the other, after a tick of its colour."""
+    beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "clip_on": False, "label": "_colour"}
+    axes.plot(
+        [-0.008, -0.008], [place - 0.35, place + 0.35], color=colour, linewidth=5, solid_capstyle="butt", **beside
+    )
+    begin_s = 0.0
+    for stage, mean_s in ((stage, means[stage]) for stage in STAGES if stage in means):
+        fill, hatch, ink = HATCHES[stage]
+        axes.barh(place, mean_s, 0.7, begin_s, color=fill, edgecolor=ink, hatch=hatch, linewidth=0, label=stage)
+        axes.barh(place, mean_s, 0.7, begin_s, fill=False, edgecolor="#404040", linewidth=0.7, label="_edge")
+        begin_s += mean_s
+
+
+def _legend(figure: Figure, there: Sequence[str]) -> None:
+    from matplotlib.patches import Patch
+
+    handles = []
+    for stage in there:
+        fill, hatch, ink = HATCHES[stage]
+        patch = Patch(facecolor=fill, edgecolor=ink if hatch else "#404040", hatch=hatch, linewidth=0.4)
+        handles.append(patch)
+    figure.legend(handles, list(there), loc="outside upper center", ncols=len(there), columnspacing=1.5)
+
+
+def stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
+    """Mean seconds of each stage that is known of a configuration's rows; empty where none was detected."""
+    rows = rows[rows["detected"].astype(bool) & rows["captured_s"].notna()]
+    if not len(rows):
+        return {}
+    onset_s, captured_s, known_s = (rows[c].to_numpy(dtype=float) for c in ("onset_s", "captured_s", "detection_s"))
+    result = {}
+    sight_s = rows["in_sight_s"].to_numpy(dtype=float) if "in_sight_s" in rows else np.full(len(rows), np.nan)
+    if np.isnan(sight_s).all():
+        result[UNTIL_CAPTURED] = captured_s - onset_s
+    else:
+        seen_s = np.fmin(sight_s, captured_s)
+        result |= {HIDDEN: seen_s - onset_s, IN_SIGHT: captured_s - seen_s}
+    result |= _since_captured(known_s - captured_s, experiment, name)
+    # To a nanosecond: 3.9 − 3 is not 0.9.
+    return {stage: float(np.round(values.mean(), 9)) + 0.0 for stage, values in result.items()}
+
+
+def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[str, Float]:
+    configuration = experiment.configurations[name]
+    units = experiment.units_of(configuration)
+    by_id = by_truth(configuration) and not experiment.measure.match.always
+    if by_id and experiment.measure.confirm.hits == 1:
+        return {TRANSPORT: delay_s, FUSION: np.zeros_like(delay_s)}
+    latency_s = {configuration.latency_of(unit) for unit in units} or {configuration.latency_of("truth")}
+    fixed_s = latency_s.pop() if len(latency_s) == 1 else None
+    if fixed_s is None or any(unit in experiment.recorded for unit in units):
+        return {SINCE_CAPTURED: delay_s}
+    transport_s = np.minimum(delay_s, fixed_s)
+    return {TRANSPORT: transport_s, FUSION: delay_s - transport_s}
+
+
+def _beside(total_s: float, detected: int, rows: int) -> str:
+    if not detected:
+        return " never known"
+    return f" {total_s:.3g} s" + ("" if detected == rows else f", {percent(detected / rows)} known")

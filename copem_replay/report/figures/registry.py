@@ -1,0 +1,136 @@
+"""All figures, a row each: `plot` writes every one that can be drawn, the report embeds those that need no recording.
+
+A figure of one's own is one more row, `FIGURES["name"] = FigureKind(…)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from copem_replay.report.figures.detection_curves import MOST_BANDS, curves_figure, one_by_one_figure
+from copem_replay.report.figures.distances import distances_about, distances_figure
+from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
+from copem_replay.report.figures.sweeps import sweeps_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from copem_replay.results.read import Results
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is drawn. None: all configurations; of log, object and run the ones that tell most (`choose`)."""
+
+    configurations: tuple[str, ...] | None = None
+    log: str | None = None
+    object_id: str | None = None
+    run: int | None = None
+
+
+def _nothing_missing(results: Results, selection: Selection) -> str | None:
+    return None
+
+
+def _no_text(results: Results) -> Sequence[str]:
+    return ()
+
+
+@dataclass(frozen=True)
+class FigureKind:
+    """A figure. `title`: its heading in the report. `shows`: what it shows, for readers who cannot see it.
+
+    `draw` makes it (`new_figure` within `style()`), and raises RecordingError where `needs_recording` and the recording
+    is missing. `missing`: the reason why these results have no such figure, "" if it need not be given, None: they have
+    one. `about`: paragraphs above it in the report.
+    """
+
+    title: str
+    shows: str
+    draw: Callable[[Results, Selection], Figure]
+    missing: Callable[[Results, Selection], str | None] = _nothing_missing
+    about: Callable[[Results], Sequence[str]] = _no_text
+    needs_recording: bool = False
+
+
+def _runs(results: Results, of: Selection) -> Figure:
+    from copem_replay.report.figures.single_runs import runs_figure  # with all that replays a run
+
+    return runs_figure(results, configurations=of.configurations, log=of.log, object_id=of.object_id, run=of.run)
+
+
+def _few_enough(results: Results, selection: Selection) -> str | None:
+    return "" if len(results.chosen(selection.configurations)) <= MOST_BANDS else None
+
+
+def _no_sweep(results: Results, selection: Selection) -> str | None:
+    names = results.chosen(selection.configurations)
+    if results.sweep is None:
+        return ""
+    if results.sweep["configuration"].isin(names).any():
+        return None
+    return f"{results.folder}/sweep.csv has no rows of {', '.join(names)}"
+
+
+def _no_stages(results: Results, selection: Selection) -> str | None:
+    return no_stages(results, results.chosen(selection.configurations))
+
+
+def _curves_about(results: Results) -> Sequence[str]:
+    return (
+        "A curve gives the share of all looks (measured objects × runs × logs) that are detected this long after the "
+        "clock started: the cumulative incidence of detection (Aalen–Johansen, departure competing). Objects that "
+        "leave the scene undetected count as never detected and keep the curve below 100 %. Where lines coincide, the "
+        "thinner ones are on top.",
+    )
+
+
+def _sweeps_about(results: Results) -> Sequence[str]:
+    return (
+        "The experiment at other values of one quantity, with common random numbers per run. All numbers are in "
+        "sweep.csv.",
+    )
+
+
+FIGURES: dict[str, FigureKind] = {
+    "runs": FigureKind(
+        "Single runs",
+        "speed of the ego, distance and visible share of one object in one run, a column per configuration",
+        _runs,
+        needs_recording=True,
+    ),
+    "curves": FigureKind(
+        "How soon",
+        "share detected over the time since the clock started, a line per configuration",
+        lambda results, of: curves_figure(results, configurations=of.configurations),
+        about=_curves_about,
+    ),
+    "one_by_one": FigureKind(
+        "How soon, one by one",
+        "the same, a panel with its 95 % band per configuration",
+        lambda results, of: one_by_one_figure(results, configurations=of.configurations),
+        missing=_few_enough,
+    ),
+    "distances": FigureKind(
+        "How far away",
+        "distance at detection of every row, a strip per configuration",
+        lambda results, of: distances_figure(results, configurations=of.configurations),
+        about=distances_about,
+    ),
+    "latency_breakdown": FigureKind(
+        "Where the time goes",
+        "mean duration of the stages from the start of the clock to detection, a bar per configuration",
+        lambda results, of: latency_breakdown_figure(results, configurations=of.configurations),
+        missing=_no_stages,
+    ),
+    "sweeps": FigureKind(
+        "At other values",
+        "shares and times over each quantity that is swept",
+        lambda results, of: sweeps_figure(results, configurations=of.configurations),
+        missing=_no_sweep,
+        about=_sweeps_about,
+    ),
+}
+"""By the name of its files, in the order in which they are written."""
