@@ -93,19 +93,21 @@ class StudyResult:
 
         with taken(Path(folder), overwrite=overwrite) as place:
             check_inputs(place, [recording.path for recording in self.recordings])
-            self.fill(place)
+            fill(place, self)
+            self.folder = place.shown
         return place.shown
 
-    def fill(self, place: Place, *, skipped: Sequence[tuple[Path, str]] = (), viewer: str | None = None) -> list[str]:
-        """Write the results into a place that is taken. Returns what has to be said of them.
 
-        `skipped`: logs that are left out. `viewer`: where a Rerun viewer listens that gets what is written to .rrd.
-        """
-        from copem_replay.results.write import fill_place
+def fill(
+    place: Place, result: StudyResult, *, skipped: Sequence[tuple[Path, str]] = (), viewer: str | None = None
+) -> list[str]:
+    """Write results into a place that is taken. Returns what has to be said of them.
 
-        notes = fill_place(place, self.experiment, self.recordings, self.replayed, skipped=skipped, viewer=viewer)
-        self.folder = place.shown
-        return notes
+    `skipped`: logs that are left out. `viewer`: where a Rerun viewer listens that gets what is written to .rrd.
+    """
+    from copem_replay.results.write import fill_place
+
+    return fill_place(place, result.experiment, result.recordings, result.replayed, skipped=skipped, viewer=viewer)
 
 
 def _frame(table: pa.Table | None) -> pd.DataFrame | None:
