@@ -113,7 +113,7 @@ def _ended() -> int:
             )
             return 2
         traceback.print_exc()
-        print("copem-replay: this is a defect of copem_replay; please report it with the lines above", file=sys.stderr)
+        print("copem-replay: internal error; please report it with the lines above", file=sys.stderr)
         return 70
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from copem_replay.cli.api.study import AnyExperiment, AnyPath, AnyRecordings, Study, prepared, study_of
 from copem_replay.core.errors import InputError
 from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from copem_replay.results.place import Place
 
 
-@dataclass
+@dataclass(repr=False)
 class StudyResult:
     """What an experiment gave: pandas tables, as a results folder has them.
 
@@ -45,6 +46,11 @@ class StudyResult:
     replayed: Result
     folder: Path | None = None
     """The results folder, once they are saved."""
+
+    def __repr__(self) -> str:
+        configurations = counted(len(self.experiment.configurations), "configuration")
+        runs, logs = counted(self.experiment.runs, "run"), counted(len(self.recordings), "recording")
+        return f"StudyResult({configurations}, {runs}, {logs}, {self.folder or 'not saved'})"
 
     @property
     def detections(self) -> pd.DataFrame:
