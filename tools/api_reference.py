@@ -25,7 +25,7 @@ HEAD = """\
 Made by `tools/api_reference.py` from the docstrings. Every example runs as a test, with `import copem_replay as cr` and
 `import numpy as np`, in a folder with the project's `logs/` and the results of `logs/tc016d.yaml` in `out/tc016d`.
 
-Letters of shapes: S runs, P rows (an object in a list), F lists, N objects, U units. Units of measurement end the names:
+Letters of shapes: S runs, P rows (an object in a list), F lists, N objects, U units. Units of measurement end names:
 `_m`, `_s`, `_rad`, `_mps`. AnyExperiment: an Experiment, its keys and values in a dict, or the path of its file.
 AnyRecordings: Recordings or paths, one or several. AnyResults: Results, a saved StudyResult, or the path of a folder.
 What is not on this page is private and may change in any release.

@@ -35,7 +35,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 class TestNames:
     def test_every_name_is_there_and_for_editors_too(self) -> None:
-        (block,) = (node for node in ast.parse(INIT.read_text()).body if isinstance(node, ast.If))
+        ifs = (node for node in ast.parse(INIT.read_text()).body if isinstance(node, ast.If))
+        (block,) = (node for node in ifs if ast.unparse(node.test) == "TYPE_CHECKING")
         typed = {
             alias.asname or alias.name: (node.module, alias.name)
             for node in block.body
@@ -52,6 +53,16 @@ class TestNames:
     def test_another_name_is_refused(self) -> None:
         with pytest.raises(AttributeError, match="'copem_replay' has no attribute 'rum'"):
             cr.rum  # type: ignore[attr-defined]  # noqa: B018
+
+    def test_type_checkers_know_them(self, tmp_path: Path) -> None:
+        (tmp_path / "page.py").write_text(
+            "import copem_replay as cr\nreveal_type(cr.run)\nresult: int = cr.run('')\ncr.rum\n"
+        )
+        check = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", tmp_path / "page.py"]
+        said = subprocess.run(check, cwd=ROOT, capture_output=True, text=True).stdout
+        assert "-> copem_replay.cli.api.run.StudyResult" in said
+        assert 'has type "StudyResult", variable has type "int"' in said
+        assert 'Module has no attribute "rum"' in said
 
     @pytest.mark.parametrize("code", ["import copem_replay", "import copem_replay; dir(copem_replay)"])
     def test_importing_it_imports_nothing_heavy(self, code: str) -> None:
