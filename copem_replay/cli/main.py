@@ -129,7 +129,7 @@ def _called(arguments: list[str]) -> int:
 
 
 def _discard_output() -> None:
-    """What is still to be printed goes nowhere: nobody reads it, or it cannot be written."""
+    """Discard what is still to be printed: its reader has gone, or it cannot be written."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
