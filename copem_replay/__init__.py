@@ -147,13 +147,15 @@ _MODULE = {
 _cache_note()  # before Numba is imported
 
 
-def __getattr__(name: str) -> object:
-    if name not in _MODULE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, own = _MODULE[name]
-    if name == "plot":
-        return _importlib.import_module(f"{module}.{name}")
-    return getattr(_importlib.import_module(module), own)
+if not TYPE_CHECKING:  # type checkers would take every name to be there
+
+    def __getattr__(name: str) -> object:
+        if name not in _MODULE:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, own = _MODULE[name]
+        if name == "plot":
+            return _importlib.import_module(f"{module}.{name}")
+        return getattr(_importlib.import_module(module), own)
 
 
 def __dir__() -> list[str]:

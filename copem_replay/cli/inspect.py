@@ -67,9 +67,10 @@ def check(
 ) -> int:
     """Report every problem of an experiment file at once, with file and line, against its recordings too."""
     from copem_replay.cli.api.study import prepared, read_study
-    from copem_replay.pipeline.notes import notes_of
 
     study = read_study(source_with(experiment, {"ego": ego}, log or (), (from_s, to_s)))
+    from copem_replay.pipeline.notes import notes_of
+
     ready, warnings = prepared(study)
     note([*notes_of(study.recordings, ready, study.experiment, replayed=False), *warnings])
     say(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")

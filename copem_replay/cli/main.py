@@ -114,7 +114,7 @@ def _ended() -> int:
             )
             return 2
         traceback.print_exc()
-        print("copem-replay: this is a defect of copem_replay; please report it with the lines above", file=sys.stderr)
+        print("copem-replay: internal error; please report it with the lines above", file=sys.stderr)
         return 70
 
 
@@ -130,7 +130,7 @@ def _called(arguments: list[str]) -> int:
 
 
 def _discard_output() -> None:
-    """What is still to be printed goes nowhere: nobody reads it, or it cannot be written."""
+    """Discard what is still to be printed: its reader has gone, or it cannot be written."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

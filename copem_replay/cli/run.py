@@ -45,13 +45,13 @@ def run(
         study = read_study(source, skip_unreadable=skip_unreadable)
         check_inputs(place, [experiment, *(recording.path for recording in study.recordings)])
         url = _viewer(study.experiment, viewer) if live or viewer is not None else None
-        from copem_replay.cli.api.run import replayed
+        from copem_replay.cli.api.run import fill, replayed
         from copem_replay.metrics.summary_text import summary_text
 
         ready, warnings = prepared(study)
         note(warnings)
         result = with_progress(lambda progress: replayed(study, ready, jobs, progress))
-        notes = result.fill(place, skipped=study.skipped, viewer=url)
+        notes = fill(place, result, skipped=study.skipped, viewer=url)
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
         note([*place.notes, *skipped, *notes, *result.replayed.costs])
         print(summary_text(result.summary))

@@ -66,7 +66,7 @@ def class_indices(names: tuple[str, ...]) -> NDArray[np.int8]:
 
 @dataclass(frozen=True)
 class Scene:
-    """What does not change during one log.
+    """The constants of one log: its objects, their classes, its start and end, its ego.
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen.
@@ -98,7 +98,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Objects as units have them, over time and runs. Shapes are checked here and nowhere else.
+    """Object states in the lists of units, over time and runs. Shapes are checked here and nowhere else.
 
     Rows of a track are in order of capture, `start[e]:start[e + 1]`; a track has at least one row. NaN may lie
     under `valid == False` and nowhere else. Covariances are None where states are exact.

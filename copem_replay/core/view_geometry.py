@@ -16,7 +16,7 @@ Noise = Callable[[str], Float]
 
 @dataclass(frozen=True)
 class Look:
-    """How each candidate row looks from its unit. All (P,); nothing here depends on the run.
+    """The view of each candidate row from its unit. All (P,); nothing here depends on the run.
 
     `observations` gives the same as a table.
 
@@ -43,7 +43,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Errors:
-    """What an error model adds to the true state. Offsets (S, P), variances (P,); None: exact.
+    """The errors that an error model adds to the true state. Offsets (S, P), variances (P,); None: exact.
 
     Position in easting and northing. Size is one offset for each of length, width and height: (3, S, P).
 

@@ -32,7 +32,7 @@ class Ideal(Fusion):
 
 
 class ListFusion(Fusion):
-    """Base of fusions that go by lists without truth, all runs and instants at once.
+    """Base of fusions without truth ids: they fuse all runs and instants at once.
 
     >>> class Nothing(cr.ListFusion):
     ...     def fuse(self, reports):
@@ -105,7 +105,7 @@ class UnitList:
 
 @dataclass(frozen=True)
 class Inbox:
-    """What the receiver has at an instant.
+    """The lists that the receiver has at one instant.
 
     `newest`: each unit's newest list, if it is not older than `max_age_s` (in the order of the experiment's units).
     `arrived`: the lists that arrive at this very instant, in order of capture; old ones that come late are among them.

@@ -38,7 +38,7 @@ _SHOWN = 12  # ids or topics named in an error (chosen)
 
 @dataclass(frozen=True)
 class Recording:
-    """A log as it was read.
+    """A recording in memory: its scene, its ground truth, and notes on what was derived, corrected or skipped.
 
     `truth` has the one unit TRUTH, one run, and arrives as it is captured. `host_id` is the host vehicle as
     the log names it, whether or not there is such an object; `scene.ego_ix` is −1 where there is none.

@@ -45,9 +45,9 @@ def cumulative_incidence(
 
     `time_s (n,)`: seconds from the onset to the detection, or to when looking ended; finite, may be negative.
     `ending (n,)`: `DETECTED` (1), `LEFT` (2) or `CENSORED` (0). Of equal times, detections and departures come before
-    censorings: who is censored at t was looked at until t, t included.
-    `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: what
-    share of all weight is still somebody, to whom the weight of the censored goes.
+    censorings: a row that is censored at t was observed until t, t included.
+    `weight (n,)`: how much each row counts, ≥ 0 (probabilities, multiplicities); None: all alike. `least`: the
+    smallest share of all weight that still takes over the weight of the censored rows.
 
     Returns `times_s (M,)`, the distinct times of detection, ascending, and `incidence (M,)`, the value from
     each of them (included) to the next. Before the first it is 0, after the last it stays. Both are empty

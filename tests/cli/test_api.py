@@ -35,7 +35,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 class TestNames:
     def test_every_name_is_there_and_for_editors_too(self) -> None:
-        (block,) = (node for node in ast.parse(INIT.read_text()).body if isinstance(node, ast.If))
+        ifs = (node for node in ast.parse(INIT.read_text()).body if isinstance(node, ast.If))
+        (block,) = (node for node in ifs if ast.unparse(node.test) == "TYPE_CHECKING")
         typed = {
             alias.asname or alias.name: (node.module, alias.name)
             for node in block.body
@@ -52,6 +53,16 @@ class TestNames:
     def test_another_name_is_refused(self) -> None:
         with pytest.raises(AttributeError, match="'copem_replay' has no attribute 'rum'"):
             cr.rum  # type: ignore[attr-defined]  # noqa: B018
+
+    def test_type_checkers_know_them(self, tmp_path: Path) -> None:
+        (tmp_path / "page.py").write_text(
+            "import copem_replay as cr\nreveal_type(cr.run)\nresult: int = cr.run('')\ncr.rum\n"
+        )
+        check = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", tmp_path / "page.py"]
+        said = subprocess.run(check, cwd=ROOT, capture_output=True, text=True).stdout
+        assert "-> copem_replay.cli.api.run.StudyResult" in said
+        assert 'has type "StudyResult", variable has type "int"' in said
+        assert 'Module has no attribute "rum"' in said
 
     @pytest.mark.parametrize("code", ["import copem_replay", "import copem_replay; dir(copem_replay)"])
     def test_importing_it_imports_nothing_heavy(self, code: str) -> None:
@@ -167,7 +178,10 @@ class TestRun:
     @pytest.mark.parametrize(
         ("change", "said"),
         [
-            ({"ego": "none", "measure": {"distance_to": "ego"}}, "ego: expected none as in the experiment, found "),
+            ({"ego": "none", "measure": {"distance_to": "ego"}}, "ego: expected none as by the experiment, found "),
+            ({"ego": "2"}, "ego: expected 2 as by the experiment, found 1; read it with read_recordings(experiment)"),
+            ({"window_s": [0, 1]}, "window_s: expected the window [0.0, 1.0] s as by the experiment, found another"),
+            ({"read": {"topic": "/other"}}, "read.topic: expected /other as in the experiment, found "),
             ({"units": {"u": {"recorded": {"topic": "t"}}}}, "expected the recorded lists of the unit u, found none"),
             ({"units": {"u": {"on": "99", "pem": "sure"}}, "pems": SURE}, "no object '99' in the log"),
         ],
@@ -177,6 +191,16 @@ class TestRun:
         with pytest.raises(cr.InputError, match=r"drive\.mcap: ") as refused:
             cr.run(plan, cr.read_recording("drive.mcap"))
         assert said in str(refused.value)
+
+    def test_a_recording_that_is_read_otherwise_by_hand_is_refused(self, here: Path) -> None:
+        """What is saved names no such ego, nor such a window: it could not be made again."""
+        plan = {"version": 1, "configurations": {"GT": {"units": "truth"}}}
+        with pytest.raises(cr.InputError, match="ego: expected 1 as by the experiment, found 2"):
+            cr.run(plan, cr.read_recording("drive.mcap", ego="2"))
+        with pytest.raises(cr.InputError, match="window_s: expected all of it as by the experiment"):
+            cr.run(plan, cr.read_recording("drive.mcap", window_s=(0, 1)))
+        part = cr.read_recording("drive.mcap", ego="2", window_s=(0, 1))
+        assert len(cr.run(plan | {"ego": "2", "window_s": [0, 1]}, part).summary) == 1
 
     @pytest.mark.parametrize(
         ("recordings", "said"),
@@ -191,6 +215,9 @@ class TestRun:
         with pytest.raises(cr.InputError) as refused:
             cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, recordings)
         assert refused.value.problems == (said,)
+
+    def test_a_result_is_a_line(self, here: Path) -> None:
+        assert repr(cr.run("e.yaml")) == "StudyResult(3 configurations, 4 runs, 1 recording, not saved)"
 
     def test_jobs(self, here: Path) -> None:
         with pytest.raises(cr.InputError, match="jobs: expected at least 1, found 0"):

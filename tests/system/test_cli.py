@@ -987,7 +987,7 @@ class Failure(NamedTuple):
     line: str
 
 
-DEFECT = "copem-replay: this is a defect of copem_replay; please report it with the lines above"
+DEFECT = "copem-replay: internal error; please report it with the lines above"
 DISK = OSError(errno.ENOSPC, "No space left on device")
 FAILURES = [
     Failure(DISK, 2, "{here}/out/e: cannot be written: No space left on device"),

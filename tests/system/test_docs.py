@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
+import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.communication.link import transmit
 from copem_replay.core.view_geometry import Look
@@ -22,7 +25,6 @@ from copem_replay.fusion.testing.check import check_fusion
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.pipeline.one_run import believed
 from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.run import Result
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
 
@@ -69,16 +71,32 @@ def test_readme_experiment_loads(tmp_path: Path) -> None:
         assert isinstance(experiment, Experiment)
 
 
-def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    monkeypatch.chdir(ROOT)
-    namespace: dict[str, object] = {"__name__": "page"}
+    (tmp_path / "logs").symlink_to(ROOT / "logs")
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, Any] = {"__name__": "page"}
     exec(code, namespace)
-    result = namespace["result"]
-    assert isinstance(result, Result)
-    assert len(result.table) > 0
-    assert len(result.summary) == 1
+    assert isinstance(namespace["result"], cr.StudyResult)
+    assert len(namespace["result"].detections) == 3000
+    assert (tmp_path / "out/python/summary.csv").is_file()
+    assert len(namespace["comparison"]) > 0
+    assert len(namespace["figure"].axes) > 0
+    assert len(namespace["fused"]) > 0
+
+
+def test_readme_and_notebooks_use_the_public_api_alone() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    for path in sorted(ROOT.glob("notebooks/*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        code += ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    whole = "\n".join(code)
+    assert re.findall(r"(?:from|import) copem_replay.*", whole) == ["import copem_replay as cr"] * 5
+    used = set(re.findall(r"\bcr\.(\w+)", whole))
+    assert used <= set(cr.__all__)
+    assert set(re.findall(r"\bcr\.plot\.(\w+)", whole)) <= set(cr.plot.__all__)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from copem_replay.cli.api.study import AnyExperiment, AnyPath, AnyRecordings, Study, prepared, study_of
 from copem_replay.core.errors import InputError
 from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from copem_replay.results.place import Place
 
 
-@dataclass
+@dataclass(repr=False)
 class StudyResult:
     """What an experiment gave: pandas tables, as a results folder has them.
 
@@ -45,6 +46,11 @@ class StudyResult:
     replayed: Result
     folder: Path | None = None
     """The results folder, once they are saved."""
+
+    def __repr__(self) -> str:
+        configurations = counted(len(self.experiment.configurations), "configuration")
+        runs, logs = counted(self.experiment.runs, "run"), counted(len(self.recordings), "recording")
+        return f"StudyResult({configurations}, {runs}, {logs}, {self.folder or 'not saved'})"
 
     @property
     def detections(self) -> pd.DataFrame:
@@ -93,22 +99,26 @@ class StudyResult:
 
         with taken(Path(folder), overwrite=overwrite) as place:
             check_inputs(place, [recording.path for recording in self.recordings])
-            self.fill(place)
+            fill(place, self)
+            self.folder = place.shown
         return place.shown
 
-    def fill(self, place: Place, *, skipped: Sequence[tuple[Path, str]] = (), viewer: str | None = None) -> list[str]:
-        """Write the results into a place that is taken. Returns what has to be said of them.
 
-        `skipped`: logs that are left out. `viewer`: where a Rerun viewer listens that gets what is written to .rrd.
-        """
-        from copem_replay.results.export import MCAP
-        from copem_replay.results.write import fill_place
-        from copem_replay.viewer.export import rrd_to
+def fill(
+    place: Place, result: StudyResult, *, skipped: Sequence[tuple[Path, str]] = (), viewer: str | None = None
+) -> list[str]:
+    """Write results into a place that is taken. Returns what has to be said of them.
 
-        exporters = [MCAP, rrd_to(viewer)]
-        notes = fill_place(place, self.experiment, self.recordings, self.replayed, exporters=exporters, skipped=skipped)
-        self.folder = place.shown
-        return notes
+    `skipped`: logs that are left out. `viewer`: where a Rerun viewer listens that gets what is written to .rrd.
+    """
+    from copem_replay.results.export import MCAP
+    from copem_replay.results.write import fill_place
+    from copem_replay.viewer.export import rrd_to
+
+    exporters = [MCAP, rrd_to(viewer)]
+    return fill_place(
+        place, result.experiment, result.recordings, result.replayed, exporters=exporters, skipped=skipped
+    )
 
 
 def _frame(table: pa.Table | None) -> pd.DataFrame | None:

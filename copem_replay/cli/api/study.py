@@ -129,12 +129,21 @@ def _study_with(source: Source, given: Experiment | None, recordings: Sequence[R
 
 
 def _misread(experiment: Experiment, recording: Recording) -> Iterator[str]:
-    """How a recording was read otherwise than the experiment says."""
-    way_out = "read it with read_recordings(experiment)"
-    scene, asked = recording.scene, experiment.ego
+    """How a recording was read otherwise than the experiment says: saved with the results, it has to read the same."""
+    way_out = "read it with read_recordings(experiment), or say so in the experiment"
+    scene, topic = recording.scene, experiment.read.topic
     found = scene.object_ids[scene.ego_ix] if scene.ego_ix >= 0 else NO_EGO
-    if isinstance(asked, str) and asked != found:
-        yield f"{recording.path}: ego: expected {asked} as in the experiment, found {found}; {way_out}"
+    expected = experiment.ego if isinstance(experiment.ego, str) else None
+    if experiment.ego is None and recording.around is None:  # the host vehicle, which moves
+        host = scene.object_number.get(recording.host_id or "", -1)
+        expected = scene.object_ids[host] if host >= 0 and scene.moving[host] else NO_EGO
+    if expected is not None and expected != found:
+        yield f"{recording.path}: ego: expected {expected} as by the experiment, found {found}; {way_out}"
+    if (experiment.window_s is None) != (recording.window is None):
+        cut = "all of it" if experiment.window_s is None else f"the window {list(experiment.window_s)} s"
+        yield f"{recording.path}: window_s: expected {cut} as by the experiment, found another window; {way_out}"
+    if topic is not None and topic != recording.topic:
+        yield f"{recording.path}: read.topic: expected {topic} as in the experiment, found {recording.topic}; {way_out}"
     for name in experiment.recorded.keys() - recording.lists.keys():
         yield f"{recording.path}: expected the recorded lists of the unit {name}, found none; {way_out}"
 

@@ -51,7 +51,7 @@ class NonconformingError(AssertionError):
 
 
 def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool = True) -> None:
-    """Raise NonconformingError for the first rule found broken; say nothing where a fusion keeps all RULES.
+    """Raise NonconformingError for the first broken rule; return nothing where a fusion keeps all RULES.
 
     `seed`: of the scenes, and of the orders tried. `units_in_any_order`: whether the order of units must not matter.
 
