@@ -143,7 +143,7 @@ def _world(
         marks.detections(out, replay, experiment, table, name, shown, colour)
     rows = replay.rows_of(np.array(shown, dtype=np.int64))
     for k in shown:
-        curves = share_curves(replay, experiment, rows, k)
+        curves = share_curves(replay, rows, k)
         plots.visible_share(out, scene.object_ids[k], curves)
         marks.on_curves(out, replay, experiment, table, scene.object_ids[k], curves, colours)
     if len(replay.looks.object_ix):
