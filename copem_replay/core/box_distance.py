@@ -6,6 +6,8 @@ A pose is (x, y, yaw), a size is (length, width); T instants, V path vertices, R
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 
@@ -71,9 +73,20 @@ def _between(values: Float, at: float) -> float:
     return float(values[k]) if f == 0 else float(values[k] + f * (values[k + 1] - values[k]))
 
 
+class Meeting(NamedTuple):
+    """The ego on one course, and the other."""
+
+    along: Float  # (T,) how far the ego is along its path
+    path: Float  # (V, 4)
+    size: Float  # (2,)
+    other: Float  # (3, T) poses
+    other_size: Float  # (2,)
+
+
 @nb.njit(cache=True)
-def _distance_at(along: Float, path: Float, size: Float, other: Float, other_size: Float, at: float) -> float:
-    """Box distance at a place between the instants; `other (3, T)`."""
+def _distance_at(meeting: Meeting, at: float) -> float:
+    """Box distance at a place between the instants."""
+    along, path, size, other, other_size = meeting
     x, y, yaw = pose_on(path, _between(along, at))
     return float(
         box_distance(
@@ -109,6 +122,7 @@ def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Fl
         step += half * abs(other[2, k] - other[2, k - 1])
         moved[k] = moved[k - 1] + (0.0 if np.isnan(step) else step)
     for r in range(len(along)):
+        meeting = Meeting(along[r], path, size, other, other_size)
         best, place = np.inf, np.inf
         first = 0
         while first < n and place == np.inf:  # stretches at which both are there
@@ -118,9 +132,9 @@ def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Fl
             last = first
             while last + 1 < n and not (np.isnan(along[r, last + 1]) or np.isnan(other[0, last + 1])):
                 last += 1
-            best, _ = _search(along[r], path, size, other, other_size, moved, most, first, last, best, False)
+            best, _ = _search(meeting, moved, most, first, last, best, False)
             if best <= _TOUCH_M:
-                _, place = _search(along[r], path, size, other, other_size, moved, most, first, last, _TOUCH_M, True)
+                _, place = _search(meeting, moved, most, first, last, _TOUCH_M, True)
                 best = 0.0
             first = last + 1
         near[r], touch[r] = best, place
@@ -128,10 +142,11 @@ def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Fl
 
 @nb.njit(cache=True)
 def _search(
-    along: Float, path: Float, size: Float, other: Float, other_size: Float, moved: Float, most: float,
-    first: int, last: int, best: float, touching: bool,
-) -> tuple[float, float]:  # fmt: skip
+    meeting: Meeting, moved: Float, most: float, first: int, last: int, best: float, touching: bool
+) -> tuple[float, float]:
     """Smallest distance between two instants if it is below `best`; or, `touching`, the first place not above `best`.
+
+    `moved (T,)`: how far a corner of the other has moved at most, `most` how far one of the ego per metre of its path.
 
     By halves, the earlier one first. Between two instants it cannot be smaller than half the sum of the distances at
     them less half of what the two have moved meanwhile; a stretch that thus cannot matter is left out.
@@ -140,8 +155,8 @@ def _search(
     known = np.empty((128, 2))
     stack[0] = first, last
     known[0] = (
-        _distance_at(along, path, size, other, other_size, float(first)),
-        _distance_at(along, path, size, other, other_size, float(last)),
+        _distance_at(meeting, float(first)),
+        _distance_at(meeting, float(last)),
     )
     if touching and known[0, 0] <= best:
         return known[0, 0], float(first)
@@ -151,12 +166,12 @@ def _search(
         depth -= 1
         a, b = stack[depth]
         da, db = known[depth]
-        movement = most * (along[b] - along[a]) + moved[b] - moved[a]
+        movement = most * (meeting.along[b] - meeting.along[a]) + moved[b] - moved[a]
         if (da + db - movement) / 2 >= best + (1e-12 if touching else -_FINE_M):
             continue
         if b - a > 1:
             m = (a + b) // 2
-            dm = _distance_at(along, path, size, other, other_size, float(m))
+            dm = _distance_at(meeting, float(m))
             if not touching:
                 best = min(best, dm)
             stack[depth], stack[depth + 1] = (m, b), (a, m)
@@ -164,28 +179,26 @@ def _search(
             depth += 2
             continue
         # Between neighbours both move straight: the distance is convex, and so above the lines on by its values.
-        dm = _distance_at(along, path, size, other, other_size, (a + b) / 2)
+        dm = _distance_at(meeting, (a + b) / 2)
         if b > a and not touching:
             best = min(best, dm)
             if 2 * dm - max(da, db) < best - _FINE_M:
-                best = min(best, _lowest(along, path, size, other, other_size, float(a), float(b))[1])
+                best = min(best, _lowest(meeting, float(a), float(b))[1])
         elif b > a:
             end, d_end = float(b), db
             if d_end > best:
-                end, d_end = _lowest(along, path, size, other, other_size, float(a), float(b))
+                end, d_end = _lowest(meeting, float(a), float(b))
             if d_end <= best:
-                return d_end, _first_touch(along, path, size, other, other_size, float(a), end)
+                return d_end, _first_touch(meeting, float(a), end)
     return best, np.inf
 
 
 @nb.njit(cache=True)
-def _first_touch(
-    along: Float, path: Float, size: Float, other: Float, other_size: Float, clear: float, within: float
-) -> float:
+def _first_touch(meeting: Meeting, clear: float, within: float) -> float:
     """Where between two places, the second in touch, the boxes first touch: by halves."""
     for _ in range(40):
         m = (clear + within) / 2
-        if _distance_at(along, path, size, other, other_size, m) <= _TOUCH_M:
+        if _distance_at(meeting, m) <= _TOUCH_M:
             within = m
         else:
             clear = m
@@ -193,21 +206,19 @@ def _first_touch(
 
 
 @nb.njit(cache=True)
-def _lowest(
-    along: Float, path: Float, size: Float, other: Float, other_size: Float, a: float, b: float
-) -> tuple[float, float]:
+def _lowest(meeting: Meeting, a: float, b: float) -> tuple[float, float]:
     """Place and value of the smallest distance between two places, which has one valley there: by golden sections."""
     g = (np.sqrt(5.0) - 1) / 2
     u, v = b - g * (b - a), a + g * (b - a)
-    du = _distance_at(along, path, size, other, other_size, u)
-    dv = _distance_at(along, path, size, other, other_size, v)
+    du = _distance_at(meeting, u)
+    dv = _distance_at(meeting, v)
     for _ in range(30):
         if du <= dv:
             b, v, dv = v, u, du
             u = b - g * (b - a)
-            du = _distance_at(along, path, size, other, other_size, u)
+            du = _distance_at(meeting, u)
         else:
             a, u, du = u, v, dv
             v = a + g * (b - a)
-            dv = _distance_at(along, path, size, other, other_size, v)
+            dv = _distance_at(meeting, v)
     return (u, du) if du <= dv else (v, dv)

@@ -8,6 +8,7 @@ paper leaves open is combined by inverse variance as well: yaw on the circle, si
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -33,10 +34,8 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1, at: In
     rows, start, object_ix, instant = _contributions(heard, at.newest, without_object_ix)
     valid = _any(heard.valid, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
-    _combine_position(
-        heard.valid, heard.x_m, heard.y_m, *floored(heard), *_information(heard), rows, start,
-        out["x_m"], out["y_m"], out["cov_ee_m2"], out["cov_en_m2"], out["cov_nn_m2"],
-    )  # fmt: skip
+    given = Positions(heard.x_m, heard.y_m, *floored(heard))
+    _combine_position(heard.valid, given, Information(*_information(heard)), rows, start, Positions(*out.values()))
     spread = {}
     for name, variance in (
         ("z_m", None), ("length_m", "size_var_m2"), ("width_m", "size_var_m2"), ("height_m", "size_var_m2"),
@@ -177,12 +176,31 @@ def _any_of(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
                     break
 
 
+class Positions(NamedTuple):
+    """Positions and their covariances, one row for all runs where these agree: (S | 1, P) each."""
+
+    x_m: Float
+    y_m: Float
+    ee_m2: Float
+    en_m2: Float
+    nn_m2: Float
+
+
+class Information(NamedTuple):
+    """Inverse covariances of positions, one row for all runs where these agree: (S | 1, P) each."""
+
+    ee: Float
+    en: Float
+    nn: Float
+
+
 @nb.njit(cache=True, nogil=True)
 def _combine_position(
-    valid: Bool, x: Float, y: Float, cov_ee: Float, cov_en: Float, cov_nn: Float,
-    ee: Float, en: Float, nn: Float, rows: Int, start: Int,
-    out_x: Float, out_y: Float, out_ee: Float, out_en: Float, out_nn: Float,
-) -> None:  # fmt: skip
+    valid: Bool, given: Positions, information: Information, rows: Int, start: Int, out: Positions
+) -> None:
+    x, y, cov_ee, cov_en, cov_nn = given
+    ee, en, nn = information
+    out_x, out_y, out_ee, out_en, out_nn = out
     for s in range(out_x.shape[0]):
         i = s if ee.shape[0] > 1 else 0  # one row where all runs agree
         j = s if x.shape[0] > 1 else 0

@@ -18,6 +18,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
+from pydantic_core import PydanticKnownError
 
 from copem_replay.core.components import Component, Slot, asked, wrong
 from copem_replay.core.own_code import is_own
@@ -143,7 +144,7 @@ def _named(value: object) -> object:
     if isinstance(value, VisibilityModel | Mapping):
         return value
     if not isinstance(value, str) or value not in BUILT_IN:
-        raise ValueError(f"expected {' or '.join(map(repr, BUILT_IN))}, found {value!r}")
+        raise PydanticKnownError("literal_error", {"expected": " or ".join(map(repr, BUILT_IN))})
     return BUILT_IN[value]
 
 

@@ -19,7 +19,7 @@ from copem_replay.metrics.detections_table import Events, table
 from copem_replay.metrics.line_of_sight import in_sight_s
 from copem_replay.pipeline.chunking import ROWS_A_STRETCH
 from copem_replay.pipeline.conversions import as_belief
-from copem_replay.pipeline.expansion import fleet_of
+from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.presence import Presence
 from copem_replay.pipeline.receiver import Believed, Receivers, World, by_truth, listen, seen_by_all
@@ -85,7 +85,7 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
 
 def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]:
     """What one block of runs (S,) gives; in several parts where not all runs have the same units."""
-    presence = Presence.of(replay.fleet, replay.scene.log, runs)
+    presence = Presence.of(replay.expanded, replay.scene.log, runs)
     measure = experiment.measure
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_all(experiment)
     if by_entry:
@@ -169,10 +169,10 @@ class _Judge:
 
 def _in_sight(replay: Replay, experiment: Experiment, presence: Presence) -> dict[str, Float]:
     """By configuration when any of its units first has each look in sight: (S | 1, M)."""
-    fleet = fleet_of(experiment, replay.scene).experiment
+    units = replay.expanded.with_(experiment)
     return {
-        name: in_sight_s(replay.first_sights_s, fleet, fleet.units_of(configuration), presence.listing)
-        for name, configuration in fleet.configurations.items()
+        name: in_sight_s(replay.first_sights_s, units, units.units_of(configuration), presence.listing)
+        for name, configuration in units.configurations.items()
     }
 
 
@@ -180,7 +180,7 @@ def _by_truth_id(
     replay: Replay, experiment: Experiment, runs: Int, presence: Presence, sight_s: dict[str, Float]
 ) -> dict[str, Events]:
     """Detections of the configurations that have truth ids: they need no states, only who was listed."""
-    units = fleet_of(experiment, replay.scene).experiment
+    units = replay.expanded.with_(experiment)
     chosen = {name: c for name, c in units.configurations.items() if by_truth(c)}
     if not chosen:
         return {}
@@ -199,7 +199,7 @@ def _by_truth_id(
     return events
 
 
-def _sightings(replay: Replay, experiment: Experiment, runs: Int, presence: Presence) -> Tracks:
+def _sightings(replay: Replay, experiment: ExpandedExperiment, runs: Int, presence: Presence) -> Tracks:
     """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
     pieces = []
     for stretch in replay.stretches:

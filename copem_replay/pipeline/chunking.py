@@ -16,9 +16,10 @@ from copem_replay.communication.arrivals import instants
 from copem_replay.core.interpolation import AROUND_S
 from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import Float, Scene, Tracks
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import ListFusion
 from copem_replay.perception.sensor_poses import list_instants
+from copem_replay.pipeline.expansion import ExpandedExperiment
 
 ROWS_AT_ONCE = 500_000
 """A log with at most so many candidate rows is one stretch (chosen: shown, too, it takes about 1 GB)."""
@@ -30,8 +31,8 @@ _AFTER = 0.381966
 """Where between two frames a cut is (chosen: hardly any latency brings a list there)."""
 
 
-def stretches(scene: Scene, truth: Tracks, experiment: Experiment) -> tuple[Stretch, ...]:
-    """A log in stretches of about as many candidate rows each; `experiment`: with a unit per carrier."""
+def stretches(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> tuple[Stretch, ...]:
+    """A log in stretches of about as many candidate rows each."""
     if not _can_be_cut(experiment.configurations.values()):
         return (WHOLE,)
     rows = candidate_rows(scene, truth, experiment)
@@ -47,7 +48,7 @@ def stretches(scene: Scene, truth: Tracks, experiment: Experiment) -> tuple[Stre
     return tuple(Stretch(*pair) for pair in pairwise(cuts))
 
 
-def candidate_rows(scene: Scene, truth: Tracks, experiment: Experiment) -> float:
+def candidate_rows(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> float:
     """About how many there are, those of the truth, which is perceived, too, among them."""
     lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
     return len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
@@ -63,7 +64,7 @@ class Reach:
     `heard`: by configuration the lists that its receiver hears, whatever is in them.
     """
 
-    def __init__(self, experiment: Experiment, heard: Mapping[str, Tracks]) -> None:
+    def __init__(self, experiment: ExpandedExperiment, heard: Mapping[str, Tracks]) -> None:
         self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
         self._again: list[tuple[Float, Float]] = []
         for name, configuration in experiment.configurations.items():

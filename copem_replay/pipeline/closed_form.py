@@ -25,7 +25,6 @@ from copem_replay.metrics.detection.by_truth_id import capture_instants
 from copem_replay.metrics.detections_table import distances
 from copem_replay.metrics.end_reason import texts_of
 from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
-from copem_replay.pipeline.expansion import fleet_of
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import by_truth, listen
 
@@ -74,16 +73,16 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     if experiment.measure.confirm.hits == 1:
         return
     for replay in ready:
-        units = fleet_of(experiment, replay.scene).experiment
+        units = replay.expanded.with_(experiment)
         for name in units.configurations:
             _shared_instants(replay, listen(replay.measured.tracks, replay.truth, units, name), name)
 
 
 def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
     """For each look when it is first known."""
-    experiment = fleet_of(experiment, replay.scene).experiment
-    configuration, looks, confirm = experiment.configurations[name], replay.looks, experiment.measure.confirm
-    heard = listen(replay.measured.tracks, replay.truth, experiment, name)
+    units, looks, confirm = replay.expanded.with_(experiment), replay.looks, experiment.measure.confirm
+    configuration = units.configurations[name]
+    heard = listen(replay.measured.tracks, replay.truth, units, name)
     # A model of the user's own may be above 1 by rounding.
     listed = (
         np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
@@ -100,7 +99,7 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
             counts &= heard.row_captured_s[rows] >= looks.onset_s[m] - _TOLERANCE_S
         rows = rows[counts]
         if instants is None:
-            share = replay.fleet.share if configuration.units != TRUTH else np.ones(1)
+            share = replay.expanded.share if configuration.units != TRUTH else np.ones(1)
             result.append(first_of(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share))
         else:
             instant = instants[heard.frame_ix[rows]]
@@ -111,7 +110,7 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
 def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
     """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
     came = np.isfinite(heard.arrives_s[0])
-    if heard.units != (TRUTH,) and (replay.fleet.share[heard.frame_unit_ix[came]] < 1).any():
+    if heard.units != (TRUTH,) and (replay.expanded.share[heard.frame_unit_ix[came]] < 1).any():
         raise ExperimentError(
             f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
             "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"

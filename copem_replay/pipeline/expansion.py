@@ -14,34 +14,114 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
-from copem_replay.perception.config import Carriers
+from copem_replay.io.config import Recorded
+from copem_replay.metrics.config import Braking, Measure
+from copem_replay.perception.config import Carriers, Obstacle
+from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.visibility import VisibilityModel
 
 
 @dataclass(frozen=True)
-class Fleet:
-    """An experiment over one log with a unit per carrier, and who the carriers are. U units.
+class ExpandedExperiment:
+    """An experiment over one log, with a unit for every object that may carry one. U units.
 
-    `named (U,)`: what the experiment calls the unit, `carrier (U,)`: id of the object that may carry it (else empty),
-    `share (U,)`: with which probability it does, 1 for all others.
+    `written`: the experiment as it was. `named (U,)`: its name of each unit, `carrier (U,)`: id of the object that may
+    carry the unit (else empty), `share (U,)`: the probability that it does, 1 for all others.
     """
 
-    experiment: Experiment
+    written: Experiment
+    _expanded: Experiment
     named: tuple[str, ...]
     carrier: tuple[str, ...]
     share: Float
 
+    @property
+    def units(self) -> dict[str, Unit]:
+        """(U,) all units by name: none is carried by a share of some classes."""
+        return self._expanded.units
+
+    @property
+    def modelled(self) -> dict[str, Unit]:
+        """The units that have a PEM."""
+        return self._expanded.modelled
+
+    @property
+    def recorded(self) -> dict[str, Recorded]:
+        """The units whose lists are recorded in the log."""
+        return self._expanded.recorded
+
+    @property
+    def configurations(self) -> dict[str, Configuration]:
+        """The configurations, which name these units."""
+        return self._expanded.configurations
+
+    def units_of(self, configuration: Configuration) -> tuple[str, ...]:
+        """Names of the units of one of these configurations, in order; none for the truth."""
+        return self._expanded.units_of(configuration)
+
+    @property
+    def pems(self) -> dict[str, Pem]:
+        """Perception error models by name."""
+        return self.written.pems
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Static obstacles beside those of the log."""
+        return self.written.obstacles
+
+    @property
+    def visibility(self) -> VisibilityModel:
+        """How much of each object shows."""
+        return self.written.visibility
+
+    @property
+    def max_gap_s(self) -> float:
+        """States further apart than this (s) are not interpolated between."""
+        return self.written.max_gap_s
+
+    @property
+    def seed(self) -> int:
+        """The seed of all draws."""
+        return self.written.seed
+
+    @property
+    def measure(self) -> Measure:
+        """What is measured."""
+        return self.written.measure
+
+    @property
+    def braking(self) -> Braking | None:
+        """What the declared driver does, if asked."""
+        return self.written.braking
+
+    @property
+    def same_in_all_runs(self) -> bool:
+        """Whether all runs have the same units."""
+        return bool((self.share == 1).all())
+
+    def with_(self, experiment: Experiment) -> ExpandedExperiment:
+        """The same units in an experiment that differs in its configurations, or in what is measured.
+
+        Raises ValueError where its units are others.
+        """
+        if experiment is self.written:
+            return self
+        if experiment.units != self.written.units:
+            raise ValueError("expected an experiment with the units that the log was prepared for")
+        return _expanded(experiment, self.units, self.named, self.carrier, self.share)
+
     def equipped(self, log: str, runs: Int) -> Bool | None:
         """(S, U) which units there are in each of the runs (S,); None: all."""
-        if (self.share == 1).all():
+        if self.same_in_all_runs:
             return None
         # No list and no instant to go by: the carrier and the unit's name in the experiment are the address.
         units = tuple(dict.fromkeys(self.named))
         which = np.array([units.index(name) for name in self.named])
         address = Address(units, which, object_words(self.carrier), np.zeros(len(which), dtype=np.int64))
-        return Dice(self.experiment.seed, log).bernoulli("carries", address, runs, self.share)
+        return Dice(self.seed, log).bernoulli("carries", address, runs, self.share)
 
 
-def fleet_of(experiment: Experiment, scene: Scene) -> Fleet:
+def expand(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
     """An experiment's units over one log, one for every object that may carry one.
 
     Raises ExperimentError where another unit has such a name.
@@ -66,23 +146,30 @@ def fleet_of(experiment: Experiment, scene: Scene) -> Fleet:
                 )
             units[f"{name}:{one}"] = unit.model_copy(update={"on": one})
             named, carriers, share = [*named, name], [*carriers, one], [*share, unit.on.share]
+    return _expanded(experiment, units, tuple(named), tuple(carriers), np.array(share))
+
+
+def _expanded(
+    experiment: Experiment, units: dict[str, Unit], named: tuple[str, ...], carrier: tuple[str, ...], share: Float
+) -> ExpandedExperiment:
+    """An experiment with these units in the place of its own."""
     if all(name in units for name in experiment.units):
-        return Fleet(experiment, tuple(named), tuple(carriers), np.array(share))
+        return ExpandedExperiment(experiment, experiment, named, carrier, share)
     members = {name: [unit for unit, of in zip(units, named, strict=True) if of == name] for name in experiment.units}
     changed = {"units": units, "configurations": _members_for(experiment.configurations, members)}
-    return Fleet(experiment.model_copy(update=changed), tuple(named), tuple(carriers), np.array(share))
+    return ExpandedExperiment(experiment, experiment.model_copy(update=changed), named, carrier, share)
 
 
 def of_run(experiment: Experiment, scene: Scene, run: int) -> Experiment:
     """The experiment as it is in one run: with the units that are carried in it."""
-    fleet = fleet_of(experiment, scene)
-    there = fleet.equipped(scene.log, np.array([run]))
-    if there is None:
-        return fleet.experiment
-    kept = {n: u for (n, u), on in zip(fleet.experiment.units.items(), there[0], strict=True) if on}
-    members = {name: [name] if name in kept else [] for name in fleet.experiment.units}
-    changed = {"units": kept, "configurations": _members_for(fleet.experiment.configurations, members)}
-    return fleet.experiment.model_copy(update=changed)
+    expanded = expand(experiment, scene)
+    there = expanded.equipped(scene.log, np.array([run]))
+    if there is None and expanded.units.keys() == experiment.units.keys():
+        return experiment
+    kept = {n: u for k, (n, u) in enumerate(expanded.units.items()) if there is None or there[0, k]}
+    members = {name: [name] if name in kept else [] for name in expanded.units}
+    changed = {"units": kept, "configurations": _members_for(expanded.configurations, members)}
+    return experiment.model_copy(update=changed)
 
 
 def _members_for(configurations: dict[str, Configuration], members: dict[str, list[str]]) -> dict[str, Configuration]:

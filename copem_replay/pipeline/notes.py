@@ -44,7 +44,7 @@ def notes_of(
 
 def same_units(ready: Sequence[Replay]) -> bool:
     """Whether all runs have the same units."""
-    return all(bool((replay.fleet.share == 1).all()) for replay in ready)
+    return all(replay.expanded.same_in_all_runs for replay in ready)
 
 
 def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
@@ -60,7 +60,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     yield from _idle(replay, experiment, met)
     yield from _unmeasured(replay, experiment)
     for name, unit in experiment.units.items():
-        if isinstance(unit.on, Carriers) and name not in replay.fleet.named:
+        if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})"
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
@@ -75,7 +75,7 @@ def could_meet(replay: Replay) -> Bool:
 
     Without a look at what hides what: where nothing is met here, no replay meets anything. Piece by piece of the log.
     """
-    experiment, scene = replay.fleet.experiment, replay.scene
+    experiment, scene = replay.expanded, replay.scene
     met = dict.fromkeys(experiment.modelled, False)
     _, bounds = replay.truth.by_frame
     pieces = -(-len(replay.truth.frame_ix) // _ROWS)
@@ -135,9 +135,9 @@ def _far_away(replay: Replay, experiment: Experiment) -> Iterator[str]:
 
 def _idle(replay: Replay, experiment: Experiment, met: Bool) -> Iterator[str]:
     """Units that list nothing in any run: those of one fleet in one line."""
-    fleet = replay.fleet
-    modelled = dict(zip(fleet.experiment.modelled, met.tolist(), strict=True))
-    of_name = list(zip(fleet.named, fleet.experiment.units, strict=True))
+    expanded = replay.expanded
+    modelled = dict(zip(expanded.modelled, met.tolist(), strict=True))
+    of_name = list(zip(expanded.named, expanded.units, strict=True))
     for name, unit in experiment.modelled.items():
         members = [member for named, member in of_name if named == name]
         absent = [m for m in members if not replay.placed.poses[m].present.any()]

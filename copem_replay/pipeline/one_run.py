@@ -42,7 +42,7 @@ class Beliefs:
         replay = self.replay
         if len(replay.stretches) == 1:
             return self._all
-        if candidate_rows(replay.scene, replay.truth, replay.fleet.experiment) > ROWS_HELD:
+        if candidate_rows(replay.scene, replay.truth, replay.expanded) > ROWS_HELD:
             raise ExperimentError(f"{replay.scene.log}: too long to be held at once; take a window of it")
         return replace(self, replay=replace(replay, stretches=(WHOLE,))).whole()
 
@@ -52,7 +52,7 @@ class Beliefs:
 
     def _made(self) -> Iterator[dict[str, Belief]]:
         replay, runs = self.replay, np.array([self.run])
-        [(_, presence)] = Presence.of(replay.fleet, replay.scene.log, runs).parts(runs)
+        [(_, presence)] = Presence.of(replay.expanded, replay.scene.log, runs).parts(runs)
         receivers = Receivers(runs, presence.sending)
         for world in replay.worlds(self.experiment, presence.sending):
             around = replay.surroundings_of(world.stretch)

@@ -23,7 +23,7 @@ from copem_replay.metrics.line_of_sight import first_sights
 from copem_replay.perception.observation import Candidates, KeptShares, candidates, joined_stretches
 from copem_replay.perception.sensor_poses import Placed, place
 from copem_replay.pipeline.chunking import Reach, stretches
-from copem_replay.pipeline.expansion import Fleet, fleet_of
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand
 from copem_replay.pipeline.receiver import World, listen, seen_by_all
 from copem_replay.pipeline.scoring import Surroundings
 
@@ -33,7 +33,7 @@ class Replay:
     """One log made ready: nothing in it depends on the run or on a configuration."""
 
     scene: Scene
-    fleet: Fleet  # the experiment's units over this log
+    expanded: ExpandedExperiment  # the experiment's units over this log
     truth: Tracks  # the world at its own frames, short gaps filled
     placed: Placed
     stretches: tuple[Stretch, ...]
@@ -45,12 +45,12 @@ class Replay:
     @cached_property
     def ego(self) -> EgoCourse:
         """How the ego drives through the log. There has to be one."""
-        return EgoCourse(self.scene, self.truth, self.fleet.experiment.max_gap_s)
+        return EgoCourse(self.scene, self.truth, self.expanded.max_gap_s)
 
     @cached_property
     def passing_s(self) -> dict[int, Float]:
         """For each look in conflict the beginnings of braking (K, 2), from and to, with which the ego passes."""
-        braking = self.fleet.experiment.braking
+        braking = self.expanded.braking
         if braking is None:
             return {}
         return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
@@ -78,13 +78,13 @@ class Replay:
     @cached_property
     def surroundings(self) -> Surroundings:
         """The truth at the instants of fused lists, each computed once."""
-        return Surroundings(self.scene, self.truth, self.fleet.experiment)
+        return Surroundings(self.scene, self.truth, self.expanded)
 
     def surroundings_of(self, stretch: Stretch) -> Surroundings:
         """The truth that configurations share: of a whole log it is kept, of a part of one it is made anew."""
         if stretch == WHOLE:
             return self.surroundings
-        return Surroundings(self.scene, self.truth, self.fleet.experiment)
+        return Surroundings(self.scene, self.truth, self.expanded)
 
     @cached_property
     def _shares(self) -> KeptShares:
@@ -92,7 +92,7 @@ class Replay:
 
     @cached_property
     def _whole(self) -> Candidates:
-        return candidates(self.scene, self.truth, self.fleet.experiment, self.placed)
+        return candidates(self.scene, self.truth, self.expanded, self.placed)
 
     @cached_property
     def measured(self) -> Candidates:
@@ -110,7 +110,7 @@ class Replay:
         return candidates(
             self.scene,
             self.truth,
-            self.fleet.experiment,
+            self.expanded,
             self.placed,
             from_s=stretch.from_s if from_s is None else from_s,
             until_s=stretch.until_s,
@@ -120,7 +120,7 @@ class Replay:
 
     def world(self, experiment: Experiment) -> World:
         """The log as the units of an experiment have it, by configuration."""
-        units = fleet_of(experiment, self.scene).experiment
+        units = self.expanded.with_(experiment)
         return World(self.scene, self.truth, self._whole.listable, self.recorded, units)
 
     def worlds(self, experiment: Experiment, sending: Bool | None, *, measured_only: bool = False) -> Iterator[World]:
@@ -150,29 +150,29 @@ class Replay:
     def lists_only(self, experiment: Experiment) -> World:
         """The same without what is in the lists."""
         none = np.empty(0, dtype=np.int64)
-        found = candidates(self.scene, self.truth, self.fleet.experiment, self.placed, from_s=np.inf)
+        found = candidates(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
         recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
-        units = fleet_of(experiment, self.scene).experiment
+        units = self.expanded.with_(experiment)
         return World(self.scene, self.truth.take_rows(none), found, recorded, units)
 
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
     """Everything about a log that all runs and configurations share. Raises ExperimentError where an ego is missing.
 
-    `onsets_of`: whose onsets they are, where units of the experiment are only in this run (`fleet.of_run`).
+    `onsets_of`: whose onsets they are, where units of the experiment are only in this run (`expansion.of_run`).
     """
     scene = recording.scene
     if scene.ego_ix < 0:
         for key, asked in (("braking", experiment.braking), ("measure.conflict", experiment.measure.conflict)):
             if asked is not None:
                 raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
-    fleet = fleet_of(experiment, scene)
+    expanded = expand(experiment, scene)
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
-    placed = place(scene, truth, fleet.experiment)
+    placed = place(scene, truth, expanded)
     recorded = recorded_units(
         recording.lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
     on = looks(scene, truth, placed.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)
-    cut = stretches(scene, truth, fleet.experiment)
-    return Replay(scene, fleet, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries)
+    cut = stretches(scene, truth, expanded)
+    return Replay(scene, expanded, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.pipeline.expansion import Fleet
+from copem_replay.pipeline.expansion import ExpandedExperiment
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Presence:
         return cls(there[None], there)
 
     @classmethod
-    def of(cls, fleet: Fleet, log: str, runs: Int) -> Presence:
+    def of(cls, expanded: ExpandedExperiment, log: str, runs: Int) -> Presence:
         """Each of the runs (S,) with its own units."""
-        equipped = fleet.equipped(log, runs)
-        there = np.ones(len(fleet.named), dtype=bool)
+        equipped = expanded.equipped(log, runs)
+        there = np.ones(len(expanded.named), dtype=bool)
         return cls.same(there) if equipped is None else cls(equipped, there)
 
     def parts(self, runs: Int) -> Iterator[tuple[Int, Presence]]:

@@ -16,13 +16,14 @@ from copem_replay.core.object_list import Lists, TellsOf
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.time_chunk import WHOLE, Stretch
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
-from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
 from copem_replay.perception.observation import Candidates
 from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline.conversions import as_lists
+from copem_replay.pipeline.expansion import ExpandedExperiment
 
 if TYPE_CHECKING:
     from copem_replay.io.recorded_units import RecordedUnits
@@ -42,7 +43,7 @@ class World:
     truth: Tracks
     found: Candidates
     recorded: RecordedUnits | None
-    experiment: Experiment
+    experiment: ExpandedExperiment
     stretch: Stretch = WHOLE
 
 
@@ -89,7 +90,7 @@ def seen_by_all(world: World, runs: Int, *, states: States, equipped: Bool | Non
     return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
 
 
-def listen(seen: Tracks, truth: Tracks, experiment: Experiment, name: str, there: Bool | None = None) -> Tracks:
+def listen(seen: Tracks, truth: Tracks, experiment: ExpandedExperiment, name: str, there: Bool | None = None) -> Tracks:
     """What reaches the receiver of the configuration `name`: the lists of its units, late; those of the others never.
 
     `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn

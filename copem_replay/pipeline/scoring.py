@@ -15,10 +15,9 @@ import numpy as np
 from copem_replay.core.agree import AGREE
 from copem_replay.core.interpolation import AROUND_S, at_instants
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
-from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.accuracy.aggregator import Assessment
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_runs
-from copem_replay.metrics.config import Measure
+from copem_replay.metrics.config import Measure, MetricsSetup
 from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.episodes import Looks, Reference, measured_objects, reference_at
@@ -34,7 +33,7 @@ class Surroundings:
 
     scene: Scene
     truth: Tracks
-    experiment: Experiment
+    experiment: MetricsSetup
     _worlds: dict[bytes, Tracks] = field(default_factory=dict)
     _references: dict[bytes, Reference] = field(default_factory=dict)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.tracks import Float, Int, Tracks
-from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Candidates
 from copem_replay.perception.sensor_poses import carrier
 from copem_replay.pipeline.prepare import Replay
@@ -24,9 +23,9 @@ class Curve:
     share: Float
 
 
-def share_curves(replay: Replay, experiment: Experiment, found: Candidates, object_ix: int) -> dict[str, Curve]:
+def share_curves(replay: Replay, found: Candidates, object_ix: int) -> dict[str, Curve]:
     """By whom an object is seen, and how much of it; nobody's curve is left out. `found`: its rows, at least."""
-    scene, tracks = replay.scene, found.tracks
+    scene, experiment, tracks = replay.scene, replay.expanded, found.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)

@@ -145,7 +145,7 @@ def _world(
         event_markers.detections(out, replay, experiment, table, name, shown, colour)
     rows = replay.rows_of(np.array(shown, dtype=np.int64))
     for k in shown:
-        shares = share_curves(replay, experiment, rows, k)
+        shares = share_curves(replay, rows, k)
         curves.visible_share(out, scene.object_ids[k], shares)
         event_markers.on_curves(out, replay, experiment, table, scene.object_ids[k], shares, colours)
     if len(replay.looks.object_ix):

@@ -120,7 +120,7 @@ def test_a_body_that_is_not_there_cannot_hide() -> None:
 @pytest.mark.parametrize(
     ("written", "said"),
     [
-        ("curved", "expected 'surface' or 'flat', found 'curved'"),
+        ("curved", "should be 'surface' or 'flat'"),
         ({"kind": "curved"}, "kind: expected package.module:Class; found 'curved'"),
         ({"kind": f"{HERE}:Any"}, "is no kind of copem_replay.perception.visibility.VisibilityModel"),
     ],

@@ -349,12 +349,12 @@ def test_lists_captured_at_different_times_that_arrive_together() -> None:
 def test_the_truth_is_certain() -> None:
     for hits, of, known in ((1, 1, 500), (2, 3, 600), (3, 3, 700)):
         world = World(100, 8, {"a": frozenset(range(2, 9))}, {"ego": Station(0.5)}, hits, of)
-        ready, _ = replayed(world)
+        ready, replayed_plan = replayed(world)
         plan = experiment(
             configurations={"GT": {"units": "truth", "latency_s": 0.3}},
             units={},
             measure={"onset": {"kind": "appears"}, "confirm": {"hits": hits, "of": of}},
-        )
+        ).model_copy(update={"units": replayed_plan.units})
         of, *others = distributions(ready, plan, "GT")
         assert not others
         assert ms(of.time_s[0]) == 500
@@ -857,7 +857,7 @@ class TestPassing:
         assert result.exact is not None
         (ready,) = result.replays
         (encounter,) = ready.encounters
-        braking = ready.fleet.experiment.braking
+        braking = ready.expanded.braking
         assert braking is not None
         shape, mean_s = (braking.driver.reaction.model_dump()[name] for name in ("shape", "mean_s"))
         delay_s = scipy.stats.gamma.ppf((np.arange(500) + 0.5) / 500, shape, scale=mean_s / shape)

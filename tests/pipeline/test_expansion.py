@@ -31,7 +31,7 @@ from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.accuracy_tables import with_accuracy
 from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.closed_form import distributions, exact_table
-from copem_replay.pipeline.expansion import Fleet, fleet_of, of_run
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand, of_run
 from copem_replay.pipeline.list_rates import list_rates
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
@@ -77,7 +77,7 @@ def plan(units: dict[str, Any], **changes: Any) -> Experiment:
     return experiment(**(standard | changes))
 
 
-def carried(fleet: Fleet, runs: int = 500, log: str = "scene") -> Bool:
+def carried(fleet: ExpandedExperiment, runs: int = 500, log: str = "scene") -> Bool:
     there = fleet.equipped(log, np.arange(runs))
     assert there is not None
     return there
@@ -96,8 +96,8 @@ class TestExpansion:
     def test_one_unit_for_each_carrier(self) -> None:
         """In the order of the experiment, then of the log; the ego carries none of them."""
         wanted = plan({"fleet": some(0.3), "ego": EGO, "big": some(1.0, "truck", height_m=2.0)})
-        fleet = fleet_of(wanted, street().scene)
-        units = fleet.experiment.units
+        fleet = expand(wanted, street().scene)
+        units = fleet.units
         assert list(units) == ["fleet:12", "fleet:3", "fleet:b", "ego", "big:7"]
         assert [unit.on for unit in units.values()] == ["12", "3", "b", "ego", "7"]
         assert [unit.height_m for unit in units.values()] == [None, None, None, None, 2]
@@ -116,17 +116,17 @@ class TestExpansion:
         ],
     )
     def test_classes_and_groups(self, classes: list[str], expected: list[str]) -> None:
-        fleet = fleet_of(plan({"f": some(0.5, *classes), "ego": EGO}), street().scene)
-        assert list(fleet.experiment.units) == [*(f"f:{name}" for name in expected), "ego"]
+        fleet = expand(plan({"f": some(0.5, *classes), "ego": EGO}), street().scene)
+        assert list(fleet.units) == [*(f"f:{name}" for name in expected), "ego"]
 
     def test_the_ego_by_any_choice_carries_none(self) -> None:
         scene = street(ego="12").scene
-        assert fleet_of(plan({"f": some(0.5)}), scene).carrier == ("ego", "3", "b")
-        assert fleet_of(plan({"f": some(0.5)}), street(ego=None).scene).carrier == ("ego", "12", "3", "b")
+        assert expand(plan({"f": some(0.5)}), scene).carrier == ("ego", "3", "b")
+        assert expand(plan({"f": some(0.5)}), street(ego=None).scene).carrier == ("ego", "12", "3", "b")
 
     def test_parked_ones_may_carry_one_too(self) -> None:
         parked = Thing("p", "car", standing(9, 9), moving=False)
-        assert fleet_of(plan({"f": some(0.5)}), street([*things(), parked]).scene).carrier[-1] == "p"
+        assert expand(plan({"f": some(0.5)}), street([*things(), parked]).scene).carrier[-1] == "p"
 
     def test_configurations_name_them_by_the_unit(self) -> None:
         wanted = plan(
@@ -137,7 +137,7 @@ class TestExpansion:
                 "some": {"units": ["fleet", "ego"], "latency_s": {"fleet": 0.2, "big": 0.4, "default": 0.1}},
             },
         )
-        expanded = fleet_of(wanted, street().scene).experiment
+        expanded = expand(wanted, street().scene)
         truth, everyone, part = expanded.configurations.values()
         assert truth == wanted.configurations["GT"]
         assert everyone == wanted.configurations["all"]
@@ -156,10 +156,23 @@ class TestExpansion:
 
     def test_nothing_to_expand(self) -> None:
         wanted = plan({"ego": EGO, "v2v": {"on": "7", "pem": "p"}})
-        fleet = fleet_of(wanted, street().scene)
-        assert fleet.experiment is wanted
+        fleet = expand(wanted, street().scene)
+        assert fleet.units is wanted.units
         assert fleet.equipped("scene", np.arange(3)) is None
         assert of_run(wanted, street().scene, 0) is wanted
+
+    def test_other_configurations_of_the_same_units(self) -> None:
+        late = {"late": {"units": ["fleet"], "latency_s": {"fleet": 0.2, "default": 0.05}}}
+        first, other = (
+            plan({"fleet": some(0.5), "ego": EGO}),
+            plan({"fleet": some(0.5), "ego": EGO}, configurations=late),
+        )
+        found, expected = expand(first, street().scene).with_(other), expand(other, street().scene)
+        assert found.configurations == expected.configurations
+        assert found.units == expected.units
+        assert found.written is other
+        with pytest.raises(ValueError, match="the units that the log was prepared for"):
+            found.with_(plan({"fleet": some(0.6), "ego": EGO}))
 
     def test_no_carrier_in_the_log(self) -> None:
         """As if there were no such unit."""
@@ -189,7 +202,7 @@ class TestExpansion:
         assert len(caught.value.problems) == 1
         wanted = plan({"ego": EGO, "fleet": some(0.5), "fleet:99": mast})
         assert list(against_log(wanted, street())) == []
-        assert list(fleet_of(wanted, street().scene).experiment.units)[-1] == "fleet:99"
+        assert list(expand(wanted, street().scene).units)[-1] == "fleet:99"
 
 
 # ------------------------------------------------------------------------------------- who carries one, and when
@@ -200,20 +213,20 @@ class TestShare:
     @given(st.floats(0, 1), st.floats(0, 1), st.integers(-3, 3))
     def test_who_does_at_a_share_does_at_a_larger_one(self, a: float, b: float, seed: int) -> None:
         scene = street().scene
-        fewer, more = (carried(fleet_of(plan({"e": EGO, "f": some(x)}, seed=seed), scene), 100)
+        fewer, more = (carried(expand(plan({"e": EGO, "f": some(x)}, seed=seed), scene), 100)
                        if x < 1 else np.ones((100, 4), dtype=bool) for x in sorted((a, b)))  # fmt: skip
         assert not (fewer & ~more).any()
 
     def test_thirty_of_a_hundred_are_among_fifty(self) -> None:
         scene = street().scene
-        thirty, fifty = (carried(fleet_of(plan({"f": some(x)}), scene)) for x in (0.3, 0.5))
+        thirty, fifty = (carried(expand(plan({"f": some(x)}), scene)) for x in (0.3, 0.5))
         assert not (thirty & ~fifty).any()
         assert (fifty & ~thirty).any(axis=0).all()
 
     def test_the_share_is_that_of_all_runs_and_of_each_carrier(self) -> None:
         """Counts by the binomial distribution; so are pairs, of carriers and of units: each draws by itself."""
         units = {"e": EGO, "f": some(0.3, "vehicles"), "g": some(0.6, "vehicles")}
-        fleet = fleet_of(plan(units), street().scene)
+        fleet = expand(plan(units), street().scene)
         runs = 4000
         there = carried(fleet, runs)
         assert there[:, 0].all()
@@ -225,11 +238,11 @@ class TestShare:
 
     def test_runs_logs_and_seeds_draw_anew(self) -> None:
         wanted = plan({"f": some(0.5, "vehicles")})
-        fleet = fleet_of(wanted, street().scene)
+        fleet = expand(wanted, street().scene)
         here = carried(fleet)
         others = [
             carried(fleet, log="other"),
-            carried(fleet_of(wanted.model_copy(update={"seed": 8}), street().scene)),
+            carried(expand(wanted.model_copy(update={"seed": 8}), street().scene)),
             np.roll(here, 1, axis=0),
             np.roll(here, 1, axis=1),
         ]
@@ -239,7 +252,7 @@ class TestShare:
             assert min(law.cdf(agree), law.sf(agree - 1)) > RISK / 2
 
     def test_a_run_by_itself(self) -> None:
-        fleet = fleet_of(plan({"f": some(0.4), "e": EGO}), street().scene)
+        fleet = expand(plan({"f": some(0.4), "e": EGO}), street().scene)
         whole = carried(fleet, 60)
         for k in (0, 1, 17, 59):
             one = fleet.equipped("scene", np.array([k]))
@@ -248,8 +261,8 @@ class TestShare:
 
     def test_the_order_of_objects_and_other_units_do_not_matter(self) -> None:
         def by_name(wanted: dict[str, Any], log: Recording) -> dict[str, list[bool]]:
-            fleet = fleet_of(plan(wanted), log.scene)
-            return dict(zip(fleet.experiment.units, carried(fleet, 80).T.tolist(), strict=True))
+            fleet = expand(plan(wanted), log.scene)
+            return dict(zip(fleet.units, carried(fleet, 80).T.tolist(), strict=True))
 
         usual = by_name({"ego": EGO, "f": some(0.4)}, street())
         turned = by_name({"f": some(0.4), "ego": EGO}, street(things()[::-1]))
@@ -260,7 +273,7 @@ class TestShare:
 
     def test_the_name_of_the_unit_does(self) -> None:
         """Two units on the same objects are not carried together."""
-        fleet = fleet_of(plan({"f": some(0.5), "g": some(0.5)}), street().scene)
+        fleet = expand(plan({"f": some(0.5), "g": some(0.5)}), street().scene)
         there = carried(fleet)
         assert (there[:, :3] != there[:, 3:]).any(axis=0).all()
 
@@ -502,16 +515,16 @@ class TestClosedForm:
         """The mixture, by the probability of each set of carriers, of the times with these carriers for certain."""
         log, wanted = given_
         ready = prepare(log, wanted)
-        fleet = ready.fleet
+        fleet = ready.expanded
         found = in_closed_form(ready, wanted)["w"]
-        unsure = [name for name, share in zip(fleet.experiment.units, fleet.share, strict=True) if share < 1]
-        share_of = dict(zip(fleet.experiment.units, fleet.share.tolist(), strict=True))
+        unsure = [name for name, share in zip(fleet.units, fleet.share, strict=True) if share < 1]
+        share_of = dict(zip(fleet.units, fleet.share.tolist(), strict=True))
         expected: dict[int | None, float] = {}
         for outcome in itertools.product((True, False), repeat=len(unsure)):
             out = [name for name, on in zip(unsure, outcome, strict=True) if not on]
             weight = math.prod(share_of[n] if on else 1 - share_of[n] for n, on in zip(unsure, outcome, strict=True))
-            kept = {name: unit for name, unit in fleet.experiment.units.items() if name not in out}
-            certain = fleet.experiment.model_copy(update={"units": kept})
+            kept = {name: unit for name, unit in fleet.units.items() if name not in out}
+            certain = wanted.model_copy(update={"units": kept, "configurations": fleet.configurations})
             for t, p in in_closed_form(prepare(log, certain), certain)["w"].items():
                 expected[t] = expected.get(t, 0.0) + weight * p
         same(found, expected)
@@ -654,19 +667,19 @@ class TestOfRun:
             },
         )
         scene = street().scene
-        fleet = fleet_of(wanted, scene)
+        fleet = expand(wanted, scene)
         there = carried(fleet, 40)
         assert len({tuple(row) for row in there}) == 8, "all sets of three carriers"
         for k in range(40):
             one = of_run(wanted, scene, k)
-            kept = [name for name, on in zip(fleet.experiment.units, there[k], strict=True) if on]
+            kept = [name for name, on in zip(fleet.units, there[k], strict=True) if on]
             assert list(one.units) == kept
             assert one.units_of(one.configurations["fleet"]) == tuple(kept[:-1])
             assert one.units_of(one.configurations["part"]) == tuple(kept)
             late = [one.configurations["part"].latency_of(name) for name in kept]
             assert late == [0.3] * (len(kept) - 1) + [0.1]
             assert one.configurations["GT"] == wanted.configurations["GT"]
-            assert fleet_of(one, scene).equipped("scene", np.arange(3)) is None
+            assert expand(one, scene).equipped("scene", np.arange(3)) is None
 
     def test_onsets_are_those_of_all_runs(self) -> None:
         """`line_of_sight_any` does not ask who is only in some runs; no more in a run that is looked at alone."""

@@ -120,7 +120,7 @@ def _courses(
 
 def _share(axes: Axes, told: Story, results: Results, replay: Replay, look: Appearance) -> None:
     """How much of the object the ego's own units see of it, list by list, along the recorded course."""
-    curve = share_curves(replay, replay.fleet.experiment, replay.measured, told.object_ix).get(BY_EGO)
+    curve = share_curves(replay, replay.measured, told.object_ix).get(BY_EGO)
     if curve is None:
         axes.text(0.5, 0.5, "the ego carries no unit", transform=axes.transAxes, ha="center", va="center", color=FAINT)
         return
