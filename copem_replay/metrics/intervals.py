@@ -21,6 +21,7 @@ from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.random import Address, Dice, object_words
@@ -37,6 +38,8 @@ EXACT_BELOW = 100
 """Over fewer clusters, by effective size, a share's limits are never narrower than the exact ones (decision 19)."""
 FEWEST_EACH = 10
 """Nor where fewer clusters than this, by effective size, succeed or fail (chosen; `tools/coverage.py`)."""
+FEWEST_CLUSTERS = 5
+"""Fewer logs or objects than this are not resampled (the contract's)."""
 _CELLS = 4_000_000
 """Numbers held at a time (chosen: 32 MB)."""
 _ROUNDING = 1e-9
@@ -49,6 +52,17 @@ class Resamples:
 
     count: Counts
     times: Int
+
+
+def clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
+    """What is resampled whole (`runs`, `logs`, `objects`; None: too few of either), and each row's cluster (n,)."""
+    log = table["log"].astype(str)
+    thing = log + "\n" + table["object_id"].astype(str)
+    if thing.nunique() == 1:
+        return "runs", table["run"].astype(str)
+    if log.nunique() >= FEWEST_CLUSTERS:
+        return "logs", log
+    return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing
 
 
 def resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resamples:

@@ -9,7 +9,7 @@ import numpy as np
 
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.fixed import NOTHING_DRAWN
-from copem_replay.metrics.summary import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 from copem_replay.metrics.summary_text import cell
 from copem_replay.report.figures.captions import percent
 from copem_replay.report.figures.detection_curves import Curve, curves_of, exact_curve, time_axis
