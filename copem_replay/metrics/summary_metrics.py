@@ -20,7 +20,7 @@ from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.braking.driver import UNRESOLVED
 from copem_replay.metrics.end_reason import competes
 from copem_replay.metrics.fixed import NOTHING_DRAWN
-from copem_replay.metrics.intervals import clusters, resamples, share_limits
+from copem_replay.metrics.intervals import clusters, resamples, share_limits, wilson
 from copem_replay.metrics.metric import Given, Metric
 from copem_replay.metrics.survival import (
     CENSORED,
@@ -30,7 +30,6 @@ from copem_replay.metrics.survival import (
     quantile_time,
     quantile_with_never,
     restricted_mean,
-    wilson,
 )
 
 
