@@ -25,7 +25,7 @@ from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.write.osi_trace import write_osi_trace
 from copem_replay.metrics.braking.driver import ConstantDeceleration, GammaReaction
 from copem_replay.metrics.braking.verdict import pass_probability, passing
-from copem_replay.metrics.survival import wilson
+from copem_replay.metrics.intervals import wilson
 from copem_replay.pipeline.closed_form import distributions
 from copem_replay.pipeline.prepare import Replay, prepare
 from make_logs import tc016d

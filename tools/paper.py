@@ -14,8 +14,8 @@ from typing import Final
 
 import pandas as pd
 
+from copem_replay.metrics.intervals import wilson
 from copem_replay.metrics.summary_text import as_text
-from copem_replay.metrics.survival import wilson
 
 RUNS: Final = 500
 PASSED: Final = {"GT": 500, "PEM": 426, "coPEM:0s": 499, "coPEM:0.5s": 474, "coPEM:1s": 323, "coPEM:1.5s": 0}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from typing import Annotated, Literal, Protocol, Self
 
@@ -10,6 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from copem_replay.core.components import Flag, Frozen, Id, Positive, Slot
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
+from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import ONSETS, InRange, Onset, Requires
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import ClassNames
@@ -91,6 +93,8 @@ class Gospa(Frozen):
 class Measure(Frozen):
     """What is measured, and from when. `accuracy`: how far off the fused lists are, beside when they hold an object.
 
+    `metrics`: own columns of the summary.
+
     >>> measure = cr.Measure(objects={"classes": ["vru"]}, onset={"kind": "in_range", "range_m": 30.0})
     >>> measure.onset.range_m, measure.confirm.hits
     (30.0, 1)
@@ -107,6 +111,19 @@ class Measure(Frozen):
     exact: Flag = False
     accuracy: Flag = True
     gospa: Gospa = Gospa()
+    metrics: Annotated[tuple[Annotated[RowMetric, Slot("metric", {})], ...], Field(exclude_if=operator.not_)] = ()
+
+    @model_validator(mode="after")
+    def _named_once(self) -> Self:
+        if self.metrics:
+            from copem_replay.metrics.summary_metrics import METRIC
+
+            names = ["configuration", *METRIC]
+            for own in self.metrics:
+                if own.name in names:
+                    raise ValueError(f"metrics: expected a name that no other column has, found {own.name!r}")
+                names.append(own.name)
+        return self
 
 
 class Braking(Frozen):

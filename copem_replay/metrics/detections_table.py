@@ -24,7 +24,8 @@ from copem_replay.metrics.braking.verdict import Verdicts, judge
 from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.end_reason import texts_of
-from copem_replay.metrics.episodes import Looks, Reference, reference_at
+from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.reference import Reference, reference_at
 from copem_replay.perception.visibility import rectangles
 
 T = TypeVar("T", bound=np.generic)

@@ -1,4 +1,4 @@
-"""Intervals over whole clusters of rows that hang together, such as logs, objects or runs.
+"""Intervals over independent rows (`wilson`), and over whole clusters of rows that hang together: logs, objects, runs.
 
 *Resample*: as many clusters as there are, drawn with replacement. Below `DRAWN_FROM` clusters there are so few that
 each is worked out once and counts as often as it would be drawn; else `RESAMPLES` are drawn by the dice, addressed by
@@ -19,13 +19,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations_with_replacement
+from statistics import NormalDist
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.random import Address, Dice, object_words
 from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.survival import tail_of
 
 Counts = NDArray[np.uint32]
 
@@ -37,6 +38,8 @@ EXACT_BELOW = 100
 """Over fewer clusters, by effective size, a share's limits are never narrower than the exact ones (decision 19)."""
 FEWEST_EACH = 10
 """Nor where fewer clusters than this, by effective size, succeed or fail (chosen; `tools/coverage.py`)."""
+FEWEST_CLUSTERS = 5
+"""Fewer logs or objects than this are not resampled (the contract's)."""
 _CELLS = 4_000_000
 """Numbers held at a time (chosen: 32 MB)."""
 _ROUNDING = 1e-9
@@ -49,6 +52,17 @@ class Resamples:
 
     count: Counts
     times: Int
+
+
+def clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
+    """What is resampled whole (`runs`, `logs`, `objects`; None: too few of either), and each row's cluster (n,)."""
+    log = table["log"].astype(str)
+    thing = log + "\n" + table["object_id"].astype(str)
+    if thing.nunique() == 1:
+        return "runs", table["run"].astype(str)
+    if log.nunique() >= FEWEST_CLUSTERS:
+        return "logs", log
+    return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing
 
 
 def resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resamples:
@@ -243,3 +257,33 @@ def alike_limits(difference: float, n: float, *, confidence: float = 0.95) -> tu
     low, high = exact_limits(size * n, n, confidence=confidence)
     low -= (1.0 - size) * exact_limits(0.0, n, confidence=confidence)[1]
     return (low, high) if difference >= 0 else (-high, -low)
+
+
+def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
+    """Bound the probability of success given `successes` of `n` independent trials: (low, high), shares.
+
+    All p for which |successes/n − p| ≤ z·√(p(1 − p)/n), z the two-sided normal quantile. Low is exactly 0
+    without a success, high exactly 1 without a failure.
+
+    Raises ValueError for n < 1, `successes` outside 0 … n, `confidence` outside (0, 1).
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    J. Amer. Statist. Assoc. 22 (1927) 209–212.
+    """
+    if n < 1 or not 0 <= successes <= n:
+        raise ValueError(f"wilson: expected 0 <= successes <= n and n >= 1, found {successes} of {n}")
+    z = -NormalDist().inv_cdf(tail_of(confidence))
+    share, z2 = successes / n, z * z
+    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = z * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
+    # At the ends the root of the equation is 0 or 1; the difference of two rounded terms need not be.
+    low = 0.0 if successes == 0 else centre - half
+    high = 1.0 if successes == n else centre + half
+    return low, high
+
+
+def tail_of(confidence: float) -> float:
+    """Halve what a confidence leaves out: the probability beyond each limit."""
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"expected a confidence between 0 and 1, ends excluded, found {confidence}")
+    return (1.0 - confidence) / 2

@@ -6,39 +6,38 @@ import pandas as pd
 
 from copem_replay.core.text import interval_words
 from copem_replay.metrics.fixed import NOTHING_DRAWN
+from copem_replay.metrics.summary_metrics import METRIC, METRICS
 
 
 def summary_text(summary: pd.DataFrame) -> str:
     """The summary for a terminal: what was known and when, then what braking would have made of it."""
-    columns = [
-        "configuration",
-        "n",
-        "list_rate_hz",
-        "detected_share",
-        "95 %",
-        "ttd_median_s",
-        "ttd_p95_s",
-        "ttd_rmst_s",
-    ]
-    shown = summary.assign(**{"95 %": _intervals(summary, "detected_share")})
-    lines = [as_text(shown[[*columns, "dad_median_m", "dad_p5_m"]])]
+    lines = [_part(summary, "summary", "detected_share")]
     lines += intervals_said(summary, "interval")
     horizon = summary["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
         lines.append(f"ttd_rmst_s: mean time to detection, never detected counting as {cell(float(horizon.iloc[0]))} s")
     if "conflict_detected_share" in summary:
-        names = [name for name in summary if name.startswith("conflict_")]
-        lines += ["", as_text(summary[["configuration", *names]])]
+        lines += ["", _part(summary, "conflict")]
         lines.append("conflict_*: the same of the first list that implies a collision")
     if "pass_share" in summary and summary["n_conflict"].any():
-        verdicts = summary.assign(**{"95 %": _intervals(summary, "pass_share")})
-        exact = ["pass_share_exact"] if "pass_share_exact" in summary else []
-        lines += ["", as_text(verdicts[["configuration", "n_conflict", "pass_share", "95 %", *exact]])]
+        lines += ["", _part(summary, "braking", "pass_share")]
         lines += intervals_said(summary, "pass_interval")
         lines.append(
             "pass_share: of those in conflict, how many the declared driver, braking when it knew, stays clear of"
         )
+    own = [name for name in summary if name not in ("configuration", *METRIC)]
+    if own:
+        lines += ["", as_text(summary[["configuration", *own]])]
     return "\n".join(lines)
+
+
+def _part(summary: pd.DataFrame, part: str, share: str = "") -> str:
+    """The columns of a part; the limits of its share beside it."""
+    names = ["configuration", *(metric.name for metric in METRICS if metric.part == part and metric.name in summary)]
+    if share:
+        summary = summary.assign(**{"95 %": _intervals(summary, share)})
+        names.insert(names.index(share) + 1, "95 %")
+    return as_text(summary[names])
 
 
 def _intervals(summary: pd.DataFrame, of: str) -> list[str]:

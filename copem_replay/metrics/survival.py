@@ -1,4 +1,4 @@
-"""Curves, quantiles, means and intervals over many rows. Pure functions; nothing here draws a random number.
+"""Curves, quantiles and means over many rows. Pure functions; nothing here draws a random number.
 
 *Time to detection* T: seconds from the onset to the detection, negative where the object was known before.
 Looking ends in one of three ways: the object is detected (`DETECTED`); it departs undetected (`LEFT`) and so
@@ -8,7 +8,7 @@ it is later.
 censor: F may stay below 1 for ever, and a quantile above its last value does not exist (None).
 *Restricted mean* at a horizon h: the mean of min(T, h), in which never counts as h.
 *Distance at detection*: far is good, so a row that was never detected ranks below every distance.
-*Interval*: two-sided, of a share of independent rows (`wilson`); of rows that hang together: metrics/intervals.py.
+Intervals: metrics/intervals.py.
 
 Letters of the shapes: n rows, M distinct times of detection. Every function raises ValueError
 when shapes or values are not as said, or when there are no rows at all: that is a defect of the caller.
@@ -17,7 +17,6 @@ when shapes or values are not as said, or when there are no rows at all: that is
 from __future__ import annotations
 
 import math
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -164,29 +163,6 @@ def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float |
     return float(known[order[min(place, len(known)) - 1]]) if place > 0 else None
 
 
-def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    """Bound the probability of success given `successes` of `n` independent trials: (low, high), shares.
-
-    All p for which |successes/n − p| ≤ z·√(p(1 − p)/n), z the two-sided normal quantile. Low is exactly 0
-    without a success, high exactly 1 without a failure.
-
-    Raises ValueError for n < 1, `successes` outside 0 … n, `confidence` outside (0, 1).
-
-    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
-    J. Amer. Statist. Assoc. 22 (1927) 209–212.
-    """
-    if n < 1 or not 0 <= successes <= n:
-        raise ValueError(f"wilson: expected 0 <= successes <= n and n >= 1, found {successes} of {n}")
-    z = -NormalDist().inv_cdf(tail_of(confidence))
-    share, z2 = successes / n, z * z
-    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = z * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
-    # At the ends the root of the equation is 0 or 1; the difference of two rounded terms need not be.
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == n else centre + half
-    return low, high
-
-
 def _check_columns(first: NDArray[Any], second: NDArray[Any]) -> None:
     if first.ndim != 1 or first.shape != second.shape:
         raise ValueError(f"expected two columns of equal length, found {first.shape} and {second.shape}")
@@ -203,10 +179,3 @@ def _rows(first: NDArray[Any], second: NDArray[Any]) -> int:
 def _check_level(q: float) -> None:
     if not 0.0 < q <= 1.0:
         raise ValueError(f"expected a quantile level 0 < q <= 1, found {q}")
-
-
-def tail_of(confidence: float) -> float:
-    """Halve what a confidence leaves out: the probability beyond each limit."""
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"expected a confidence between 0 and 1, ends excluded, found {confidence}")
-    return (1.0 - confidence) / 2

@@ -81,6 +81,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
         exact=exact,
         accuracy=totals(parts),
         fixed=fixed_in(experiment.as_written()),
+        own=experiment.measure.metrics,
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = notes_of(recordings, ready, experiment, replayed=True)

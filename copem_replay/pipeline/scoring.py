@@ -20,8 +20,9 @@ from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_run
 from copem_replay.metrics.config import Measure, MetricsSetup
 from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
 from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import Looks, Reference, measured_objects, reference_at
+from copem_replay.metrics.episodes import Looks, measured_objects
 from copem_replay.metrics.matching import Matches, match, match_both
+from copem_replay.metrics.reference import Reference, reference_at
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.receiver import Believed

@@ -14,7 +14,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.episodes import Reference
+from copem_replay.metrics.reference import Reference
 from copem_replay.perception.sensor_poses import carrier
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve

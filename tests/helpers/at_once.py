@@ -9,8 +9,9 @@ from copem_replay.metrics.accuracy.statistics import Accuracy, Settings
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps
 from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import Looks, Reference
+from copem_replay.metrics.episodes import Looks
 from copem_replay.metrics.matching import Matches
+from copem_replay.metrics.reference import Reference
 
 
 def assess(

@@ -16,7 +16,7 @@ from copem_replay.core.object_list import Entries, Lists
 from copem_replay.core.tracks import CLASSES
 from copem_replay.metrics.accuracy import metrics as accuracy_figures
 from copem_replay.metrics.accuracy.aggregator import Assessment
-from copem_replay.metrics.accuracy.metrics import FIGURES
+from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.accuracy.nees import expected
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, total
 from copem_replay.metrics.gospa import gospa, ospa
@@ -68,8 +68,11 @@ def assessed(
     )  # fmt: skip
 
 
+FIGURES = {metric.name: metric for metric in ACCURACY}
+
+
 def figure(name: str, of: Accuracy) -> float | None:
-    return FIGURES[name](total([of]))
+    return FIGURES[name].value(total([of]))
 
 
 def standing(x_m: float, y_m: float, count: int) -> list[tuple[float, float]]:

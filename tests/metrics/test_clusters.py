@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from copem_replay.metrics.summary import clusters
+from copem_replay.metrics.intervals import clusters
 
 
 def rows(logs: int, objects: int, runs: int = 2) -> pd.DataFrame:

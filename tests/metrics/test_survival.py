@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from copem_replay.metrics.intervals import wilson
 from copem_replay.metrics.survival import (
     CENSORED,
     DETECTED,
@@ -19,7 +20,6 @@ from copem_replay.metrics.survival import (
     quantile_time,
     quantile_with_never,
     restricted_mean,
-    wilson,
 )
 
 Array = npt.NDArray[np.float64]

@@ -14,8 +14,9 @@ from scipy.special import gammainc
 from copem_replay.core.object_list import Lists
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Accuracy, Settings
-from copem_replay.metrics.episodes import Looks, Reference
+from copem_replay.metrics.episodes import Looks
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
+from copem_replay.metrics.reference import Reference
 
 Array = npt.NDArray[Any]
 SAME_S = 1e-6

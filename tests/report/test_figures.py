@@ -28,8 +28,7 @@ from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.metrics.intervals import resamples, share_limits
-from copem_replay.metrics.summary import clusters
+from copem_replay.metrics.intervals import clusters, resamples, share_limits
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.pipeline.run import run
 from copem_replay.report.figures import (

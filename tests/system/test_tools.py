@@ -15,7 +15,7 @@ from scipy.stats import binom
 
 from copem_replay.experiment.file import load
 from copem_replay.experiment.validate import problems, read_logs
-from copem_replay.metrics.survival import wilson
+from copem_replay.metrics.intervals import wilson
 from copem_replay.pipeline.run import run
 from tests.helpers.reports import reports_of
 

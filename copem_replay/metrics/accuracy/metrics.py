@@ -1,12 +1,19 @@
-"""The figures made of the statistics of `metrics/accuracy/statistics.py`, where each is defined. None: there is nothing to make it of."""
+"""The metrics made of the statistics of `metrics/accuracy/statistics.py`, where each is defined.
+
+None: there is nothing to make it of.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.metrics.accuracy.statistics import Total
+from copem_replay.metrics.metric import Metric
+
+if TYPE_CHECKING:
+    from copem_replay.metrics.accuracy.statistics import Total
 
 
 def _ratio(sums: float, count: float) -> float | None:
@@ -145,13 +152,42 @@ def existence_error(of: Total) -> float | None:
     return _ratio(np.abs(bins["with_object"] - bins["existence"]).sum(), bins["entries"].sum())
 
 
-FIGURES: dict[str, Callable[[Total], float | None]] = {
-    figure.__name__: figure
-    for figure in (
-        position_rmse_m, position_rmse_captured_m, bias_east_m, bias_north_m, velocity_rmse_mps, age_s,
-        gospa_m, gospa_localisation_m, gospa_missed_m, gospa_false_m, ospa_m, ghosts_per_min,
-        stale_ghosts_per_min, duplicates_per_min, nees, nees_expected, nees_low, nees_high, beyond_gate_share,
-        existence_error, identity_switches, mtl_s,
-    )
-}  # fmt: skip
-"""Columns of the summary by name."""
+_TOTAL = attrgetter("accuracy")
+"""The sums that all of them are made of; None where the experiment asks for no accuracy."""
+
+ACCURACY = (
+    Metric("position_rmse_m", _TOTAL, position_rmse_m, -1,
+           "root mean square error of positions against the truth when the list is available", "accuracy",
+           "position error, over lists that both have"),
+    Metric("position_rmse_captured_m", _TOTAL, position_rmse_captured_m, -1,
+           "the same at the instant the entry tells of", "accuracy"),
+    Metric("bias_east_m", _TOTAL, bias_east_m, 0, "mean easting error, entry minus truth"),
+    Metric("bias_north_m", _TOTAL, bias_north_m, 0, "mean northing error, entry minus truth"),
+    Metric("velocity_rmse_mps", _TOTAL, velocity_rmse_mps, -1, "of velocities", "accuracy"),
+    Metric("age_s", _TOTAL, age_s, -1, "available minus captured, mean", "accuracy"),
+    Metric("gospa_m", _TOTAL, gospa_m, -1,
+           "GOSPA of the lists: places, misses and false entries in one number", "accuracy",
+           "GOSPA, over lists that both have"),
+    Metric("gospa_localisation_m", _TOTAL, gospa_localisation_m, -1, "the part of GOSPA that is of pairs"),
+    Metric("gospa_missed_m", _TOTAL, gospa_missed_m, -1, "the part of GOSPA that is of misses"),
+    Metric("gospa_false_m", _TOTAL, gospa_false_m, -1, "the part of GOSPA that is of false entries"),
+    Metric("ospa_m", _TOTAL, ospa_m, -1, "OSPA of the lists, mean"),
+    Metric("ghosts_per_min", _TOTAL, ghosts_per_min, -1,
+           "entries at no object, per minute of log", "accuracy", "entries at no object, per minute"),
+    Metric("stale_ghosts_per_min", _TOTAL, stale_ghosts_per_min, -1,
+           "of these, at an object when they were captured", "accuracy"),
+    Metric("duplicates_per_min", _TOTAL, duplicates_per_min, -1,
+           "second entries at an object, per minute of log", "accuracy"),
+    Metric("nees", _TOTAL, nees, 0,
+           "squared error by claimed covariance: more than expected where covariances are too small", "accuracy"),
+    Metric("nees_expected", _TOTAL, nees_expected, 0,
+           "what it is where they are true: 2, less what the gate cuts off", "accuracy"),
+    Metric("nees_low", _TOTAL, nees_low, 0, "lower limit of nees where covariances are true, 95 %"),
+    Metric("nees_high", _TOTAL, nees_high, 0, "upper limit of nees where covariances are true, 95 %"),
+    Metric("beyond_gate_share", _TOTAL, beyond_gate_share, 0,
+           "of errors as the claimed covariances have them, how many the gate lets not through"),
+    Metric("existence_error", _TOTAL, existence_error, -1, "expected calibration error of the claimed existence"),
+    Metric("identity_switches", _TOTAL, identity_switches, -1, "matches by another track than the last one, mean"),
+    Metric("mtl_s", _TOTAL, mtl_s, -1, "longest time unknown, mean", "accuracy"),
+)  # fmt: skip
+"""The metrics of accuracy, in the order of the columns."""

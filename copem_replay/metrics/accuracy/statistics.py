@@ -2,8 +2,8 @@
 
 All is counted once per fused list, at the instant it is available, in the lists at which there is a place to measure
 distances from (the ego). Nothing is held from one list to the next, nothing weighed by time. What a *match* is, a
-*duplicate*, a *ghost*: `metrics/matching.py`. A look's *stay*: the lists from the first instant that object and ego share to the
-end of the look, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
+*duplicate*, a *ghost*: `metrics/matching.py`. A look's *stay*: the lists from the first instant that object and ego
+share to the end of the look, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
 
 What is said of an object is asked at the instant the entry *tells of*; what the list is worth *now* at the instant it
 is available. So there are matches of two kinds, by the same rules: *pairs* are entries that are about an object then.
@@ -17,9 +17,9 @@ in the mean of others:
   not *placed*: it has neither position error nor bias nor velocity error, but all else.
 - age (s): available minus captured.
 - NEES (1): eᵀ P⁻¹ e of the position at the entry's instant, P as claimed, its eigenvalues at least 1e-9 m². The gate
-  lets no larger errors through, so where P is true the mean is `nees_expected`, 2 or less (`metrics/accuracy/nees.py`), and of what is
-  so claimed the share `beyond_gate` is no pair. Its 95 % band is for as many independent samples as run × object pairs
-  with a match, for lists are not independent.
+  lets no larger errors through, so where P is true the mean is `nees_expected`, 2 or less
+  (`metrics/accuracy/nees.py`), and of what is so claimed the share `beyond_gate` is no pair. Its 95 % band is for as
+  many independent samples as run × object pairs with a match, for lists are not independent.
 - identity switches (1): pairs of another track than the object's last pair that named a track.
 
 Over a look, by what is matched now; never matched: the worst there is:

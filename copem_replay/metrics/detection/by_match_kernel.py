@@ -1,4 +1,4 @@
-"""The compiled kernel of `metrics/detection/by_match.py`: who is known at which existence, look by look. What that means is said there."""
+"""The compiled kernel of `metrics/detection/by_match.py`: at which existence each object is known, look by look."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import pandas as pd
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.end_reason import competes
 from copem_replay.metrics.fixed import NOTHING_DRAWN, fixed_in
-from copem_replay.metrics.summary import FEWEST_CLUSTERS, clusters
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.report.figures.bands import band
 from copem_replay.report.figures.captions import list_rates, percent, short_names, study

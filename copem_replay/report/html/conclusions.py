@@ -9,7 +9,7 @@ import pandas as pd
 
 from copem_replay.core.text import counted
 from copem_replay.metrics.fixed import NOTHING_DRAWN
-from copem_replay.metrics.summary import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 from copem_replay.metrics.summary_text import cell
 from copem_replay.report.figures.captions import percent
 from copem_replay.report.html.markup import Html, joined, listed, tag

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from copem_replay.metrics.metric import RowMetric, own_metrics
+from copem_replay.metrics.summary_metrics import METRIC, METRICS, PARTS
 from copem_replay.metrics.summary_text import cell, intervals_said
 from copem_replay.report.html.markup import Html, breakable, joined, listed, table, tag
 from copem_replay.report.html.swatches import swatch
-from copem_replay.results.compare.metrics import METRICS
+from copem_replay.results.compare.metrics import METRICS as COMPARED
 from copem_replay.results.compare.tables import comparison_lines, plain, signed, without_interval
 
 if TYPE_CHECKING:
@@ -34,68 +36,16 @@ class Part:
     columns: dict[str, str]
 
 
-_PARTS = (
-    Part(
-        "summary",
-        "When, and how far away",
-        {
-            "n": "rows: runs × measured objects × logs",
-            "list_rate_hz": "fused lists per second",
-            "detected_share": "share of the rows that were detected, [95 % interval]",
-            "ttd_median_s": "time to detection: by then half were detected",
-            "ttd_p95_s": "by then 95 % were; a dash: that many never were",
-            "ttd_rmst_s": "mean time to detection, never detected counting as the horizon",
-            "dad_median_m": "distance at detection, centre to centre: half were farther away; never detected ranks "
-            "below every distance",
-            "dad_p5_m": "95 % were farther away",
-        },
-    ),
-    Part(
-        "braking",
-        "Braking in time",
-        {
-            "n_conflict": "rows in which the ego, not braking, would come too near",
-            "pass_share": "of those, how many the declared driver, braking when it knew, stays clear of, "
-            "[95 % interval]",
-            "pass_share_exact": "the same without a draw",
-        },
-    ),
-    Part(
-        "conflict",
-        "When the collision was foreseen",
-        {
-            "conflict_detected_share": "share of the rows in which a list implied a collision",
-            "conflict_ttd_median_s": "by then half had one",
-            "conflict_ttd_p95_s": "by then 95 % had",
-            "conflict_ttd_rmst_s": "mean time, never counting as the horizon",
-            "conflict_dad_median_m": "distance then: half were farther away",
-        },
-    ),
-    Part(
-        "accuracy",
-        "How far off",
-        {
-            "position_rmse_m": "root mean square error of positions against the truth when the list is available",
-            "position_rmse_captured_m": "the same at the instant the entry tells of",
-            "velocity_rmse_mps": "of velocities",
-            "age_s": "available minus captured, mean",
-            "gospa_m": "GOSPA of the lists: places, misses and false entries in one number",
-            "ghosts_per_min": "entries at no object, per minute of log",
-            "stale_ghosts_per_min": "of these, at an object when they were captured",
-            "duplicates_per_min": "second entries at an object, per minute of log",
-            "nees": "squared error by claimed covariance: more than expected where covariances are too small",
-            "nees_expected": "what it is where they are true: 2, less what the gate cuts off",
-            "mtl_s": "longest time unknown, mean",
-        },
-    ),
-)  # fmt: skip
+def _parts(own: Sequence[RowMetric]) -> list[Part]:
+    metrics = (*METRICS, *own_metrics(own))
+    return [Part(id_, caption, {m.name: m.help for m in metrics if m.part == id_}) for id_, caption in PARTS.items()]
 
 
 def summary_tables(study: Study) -> Html:
     """What `summary.csv` says, in parts of which each fits on a page."""
     rows = study.results.summary
     parts = []
-    for part in _PARTS:
+    for part in _parts(study.results.experiment.measure.metrics):
         columns = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
         wanted = part.id != "braking" or "pass_share" in columns
         if columns and wanted:
@@ -152,15 +102,8 @@ def _meanings(columns: Iterable[tuple[str, str]]) -> Html:
     return tag("dl", *terms)
 
 
-_METRICS = {
-    "detected_share": "share detected",
-    "ttd_rmst_s": "mean time to detection, never detected counting as the horizon",
+_WORDS = {name: METRIC[name].compared for name in COMPARED if name in METRIC} | {
     "ttd_rmst_s_equal_ghosts": "the same at as many ghosts per minute as asked for",
-    "dad_median_m": "median of the differences of distances at detection",
-    "position_rmse_m": "position error, over lists that both have",
-    "gospa_m": "GOSPA, over lists that both have",
-    "ghosts_per_min": "entries at no object, per minute",
-    "pass_share": "share that passes, of those in conflict",
 }
 
 
@@ -171,12 +114,12 @@ def regret_table(study: Study) -> Html:
         why = "nobody was measured" if study.best is None else "there is one configuration only"
         return tag("p", f"No differences: {why}.")
     rows = {(row.configuration, row.metric): row for row in regret.overall.itertuples(index=False)}
-    metrics = [m for m in METRICS if any((name, m) in rows for name in regret.configurations)]
+    metrics = [m for m in COMPARED if any((name, m) in rows for name in regret.configurations)]
     lines = [
         tag("tr", named(study, name), *(_difference(rows.get((name, m)), m) for m in metrics), data_row=name)
         for name in regret.configurations
     ]
-    words = [(m, f"{_METRICS[m]}; {'more' if METRICS[m] > 0 else 'less'} is better") for m in metrics]
+    words = [(m, f"{_WORDS[m]}; {'more' if COMPARED[m] > 0 else 'less'} is better") for m in metrics]
     return joined(
         [
             tag("p", *_baseline(study)),

@@ -8,7 +8,7 @@ import pandas as pd
 
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import SAME_INSTANT_NS
-from copem_replay.metrics.summary import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import Study

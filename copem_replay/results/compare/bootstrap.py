@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.metrics.intervals import Resamples, resamples
-from copem_replay.metrics.summary import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS, Resamples, resamples
 from copem_replay.results.compare.pairing import Grid
 
 _KEPT = 4

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.metrics.summary_metrics import METRIC
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
 from copem_replay.results.compare.bootstrap import Whose
 from copem_replay.results.compare.configuration_data import Ghosts, Side, Steps
@@ -30,16 +31,10 @@ from copem_replay.results.compare.differences import Figure, OfMedians, OfSums, 
 from copem_replay.results.compare.pairing import Grid
 from copem_replay.results.compare.per_list import together
 
-METRICS = {
-    "detected_share": 1,
-    "ttd_rmst_s": -1,
-    "ttd_rmst_s_equal_ghosts": -1,
-    "dad_median_m": 1,
-    "position_rmse_m": -1,
-    "gospa_m": -1,
-    "ghosts_per_min": -1,
-    "pass_share": 1,
-}
+METRICS = {name: METRIC[name.removesuffix("_equal_ghosts")].better for name in (
+    "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
+    "ghosts_per_min", "pass_share",
+)}  # fmt: skip
 """All metrics, and whether more (1) or less (−1) is better."""
 
 

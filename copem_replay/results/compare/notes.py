@@ -9,7 +9,7 @@ import pandas as pd
 
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool
-from copem_replay.metrics.summary import FEWEST_CLUSTERS
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 from copem_replay.results.compare.configuration_data import Side
 from copem_replay.results.compare.labels import Named
 from copem_replay.results.compare.per_list import shared_instants

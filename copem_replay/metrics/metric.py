@@ -1,0 +1,138 @@
+"""A metric: one column of `summary.csv`, with all that is said of it in one place.
+
+Its statistics are sums over runs, objects, lists and logs (quantiles: tables of times), and its value is made of them
+last. An own metric derives from `RowMetric`; the experiment names it in `measure: {metrics: [{kind: …}]}`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from copem_replay.core.components import Component, GivenError, asked
+from copem_replay.core.tracks import Float
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from copem_replay.metrics.accuracy.statistics import Total
+
+Value = float | int | str | None
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the statistics of one configuration are made from, over all logs, runs and measured objects.
+
+    `rows`: its rows of `detections.parquet`, log by log. `lists_fixed`, `reaction_fixed`: known alike, braking alike in
+    every run. `accuracy`, `exact`: None where the experiment asks for neither.
+    """
+
+    rows: pd.DataFrame
+    list_rate_hz: float | None
+    seed: int
+    horizon_s: float | None
+    lists_fixed: bool = False
+    reaction_fixed: bool = False
+    accuracy: Total | None = None
+    exact: pd.DataFrame | None = None  # its rows of exact.parquet
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One column of `summary.csv`.
+
+    `statistics`: sums; None: the experiment does not ask for this metric, which then has no column. Metrics that share
+    them share the function, which is called once. `value`: made of the sums; None: there is nothing to make it of.
+    `better`: 1 more, −1 less, 0 neither. `part`: the table that shows it on the terminal and in the report; empty:
+    none. `compared`: what its difference to a baseline is; empty: it is not compared.
+    """
+
+    name: str
+    statistics: Callable[[Given], Any]
+    value: Callable[[Any], Value]
+    better: Literal[-1, 0, 1]
+    help: str
+    part: str = ""
+    compared: str = ""
+
+
+def values(metrics: Iterable[Metric], given: Given) -> dict[str, Value]:
+    """The columns of one configuration."""
+    made: dict[Hashable, Any] = {}
+    row: dict[str, Value] = {}
+    for metric in metrics:
+        if metric.statistics not in made:
+            made[metric.statistics] = metric.statistics(given)
+        if made[metric.statistics] is not None:
+            row[metric.name] = metric.value(made[metric.statistics])
+    return row
+
+
+OWN = "own"
+"""The part of metrics that an experiment names."""
+
+
+class RowMetric(Component, ABC):
+    """Base of own metrics: sums over rows of `detections.parquet`, and a value made of the sums.
+
+    `name`: the column; units belong in it. `help`: its meaning in one clause, for the report. `better` as in `Metric`.
+    """
+
+    help: ClassVar[str] = ""
+    better: ClassVar[Literal[-1, 0, 1]] = 0
+
+    name: Annotated[str, Field(strict=True, pattern=r"^[a-z][a-z0-9_]*$", max_length=60)]
+
+    @abstractmethod
+    def statistics(self, rows: pd.DataFrame) -> Mapping[str, Float]:
+        """Named statistics (n,) of the n rows of one configuration in one log, in the order of run and object.
+
+        Columns: docs/measures.md. Each statistic is then summed over rows and logs.
+        """
+
+    @abstractmethod
+    def value(self, sums: Mapping[str, float]) -> float | None:
+        """The value made of the sums; None or NaN: there is nothing to make it of. Without rows it is not asked."""
+
+
+def own_metrics(components: Sequence[RowMetric]) -> tuple[Metric, ...]:
+    """The columns of own metrics."""
+    return tuple(_column(k, component) for k, component in enumerate(components))
+
+
+def _column(k: int, own: RowMetric) -> Metric:
+    where = f"measure.metrics[{k}]"
+
+    def value(sums: Mapping[str, float]) -> float | None:
+        found = asked(own, where, lambda: _number(own.value(sums))) if sums else None
+        return None if found is None or np.isnan(found) else found
+
+    return Metric(
+        own.name, lambda given: asked(own, where, lambda: _sums(own, given.rows)), value, own.better, own.help, OWN
+    )
+
+
+def _number(value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise GivenError("value", f"expected a number or None, found {type(value).__name__}")
+    return float(value)
+
+
+def _sums(own: RowMetric, rows: pd.DataFrame) -> dict[str, float]:
+    """Sums over rows and logs; empty without rows."""
+    sums: dict[str, float] = {}
+    for _, part in rows.groupby("log", sort=False):
+        for name, of_rows in own.statistics(part.reset_index(drop=True)).items():
+            column = np.asarray(of_rows, dtype=float)
+            if column.shape != (len(part),):
+                raise GivenError("statistics", f"{name}: expected shape ({len(part)},), found {column.shape}")
+            sums[name] = sums.get(name, 0.0) + float(column.sum())
+    return sums

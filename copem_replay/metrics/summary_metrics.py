@@ -1,0 +1,317 @@
+"""The metrics of `summary.csv`, in the order of its columns: what each is made of, and what is said of it.
+
+Shares, times and distances are defined in metrics/survival.py. Times are cumulative incidences with departure
+competing: an object that leaves undetected counts as never detected, and only the end of the ego or of the log censors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter, itemgetter
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.core.tracks import Bool, Float
+from copem_replay.metrics.accuracy.metrics import ACCURACY
+from copem_replay.metrics.braking.driver import UNRESOLVED
+from copem_replay.metrics.end_reason import competes
+from copem_replay.metrics.fixed import NOTHING_DRAWN
+from copem_replay.metrics.intervals import clusters, resamples, share_limits, wilson
+from copem_replay.metrics.metric import Given, Metric
+from copem_replay.metrics.survival import (
+    CENSORED,
+    DETECTED,
+    LEFT,
+    cumulative_incidence,
+    quantile_time,
+    quantile_with_never,
+    restricted_mean,
+)
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Statistics of an event: a table of the times at which it happens, and rows ranked by distance.
+
+    Without rows: no times, and every figure is None.
+    """
+
+    times_s: Float  # (M,) distinct times
+    incidence: Float  # (M,) of detection
+    distance_m: Float  # (n,) of the rows that can be ranked
+    detected: Bool  # (n,)
+    weight: Float | None  # (n,); None: all alike
+    horizon_s: float | None
+    rows: bool
+
+    def quantile_s(self, q: float) -> float | None:
+        """The time by which a share q is detected; None: that many never are."""
+        return quantile_time(self.times_s, self.incidence, q) if self.rows else None
+
+    def mean_s(self) -> float | None:
+        """The mean, never detected counting as the horizon."""
+        if not self.rows or self.horizon_s is None:
+            return None
+        return restricted_mean(self.times_s, self.incidence, self.horizon_s)
+
+    def distance_quantile_m(self, q: float) -> float | None:
+        """The distance above which a share 1 − q is detected; never detected ranks below every distance."""
+        if not len(self.detected):
+            return None
+        return quantile_with_never(self.distance_m, self.detected, q, self.weight)
+
+
+def _detections(
+    part: pd.DataFrame,
+    detected: Bool,
+    names: tuple[str, str],
+    horizon_s: float | None,
+    weight: Float | None = None,
+    least: float = 1e-12,
+) -> Detections:
+    """Statistics of rows; `names` of the columns of times and distances. Rows count by `weight (n,)`."""
+    if not len(part):
+        nothing = np.empty(0)
+        return Detections(nothing, nothing, nothing, np.empty(0, dtype=bool), None, None, rows=False)
+    ending = np.where(detected, DETECTED, np.where(competes(part["ended_by"]), LEFT, CENSORED))
+    looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
+    # To a nanosecond: of equal times detections come first, and 1 − 0.8 is less than 0.2 − 0.
+    time_s = np.round(np.where(detected, part[names[0]].to_numpy(dtype=float), looked_s), 9)
+    times, incidence = cumulative_incidence(time_s, ending, weight, least=least)
+    distance_m = part[names[1]].to_numpy(dtype=float)
+    placed = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
+    by = None if weight is None else weight[placed]
+    return Detections(times, incidence, distance_m[placed], detected[placed], by, horizon_s, rows=True)
+
+
+_DETECTION = "time_to_detection_s", "distance_at_detection_m"
+_CONFLICT = "time_to_conflict_detection_s", "distance_at_conflict_detection_m"
+
+
+def detections(given: Given) -> Detections:
+    """When objects are detected, and how far away."""
+    return _detections(given.rows, given.rows["detected"].to_numpy(dtype=bool), _DETECTION, given.horizon_s)
+
+
+def conflicts(given: Given) -> Detections | None:
+    """The same of the second event: the first list that implies a collision."""
+    if "conflict_detected" not in given.rows:
+        return None
+    return _detections(given.rows, given.rows["conflict_detected"].to_numpy(dtype=bool), _CONFLICT, given.horizon_s)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of rows and its 95 % limits: of which kind they are, and over what (None: there are none)."""
+
+    n: int
+    share: float | None
+    kind: str | None
+    over: str | None
+    low: float | None
+    high: float | None
+
+
+def _share(part: pd.DataFrame, success: Bool, seed: int, *, fixed: bool) -> Share:
+    """`fixed`: the successes are the same in every run."""
+    n = len(part)
+    share = success.mean() if n else None
+    over, cluster = clusters(part)
+    if over is None or not n:
+        return Share(n, share, None, None, None, None)
+    if over == "runs":
+        if fixed:
+            return Share(n, share, NOTHING_DRAWN, None, None, None)
+        return Share(n, share, "wilson", over, *wilson(int(success.sum()), n))
+    counted = pd.Series(success).groupby(cluster.to_numpy(), sort=True).agg(["sum", "count"])
+    # Addressed by the clusters' names: every configuration resamples the same logs or objects.
+    resampled = resamples([str(name) for name in counted.index], seed)
+    kind, low, high = share_limits(
+        counted["sum"].to_numpy(dtype=float), counted["count"].to_numpy(dtype=float), resampled
+    )
+    return Share(n, share, kind, over, low, high)
+
+
+def detected(given: Given) -> Share:
+    """The rows that are detected."""
+    return _share(given.rows, given.rows["detected"].to_numpy(dtype=bool), given.seed, fixed=given.lists_fixed)
+
+
+def foreseen(given: Given) -> float | None:
+    """The share of the rows in which a list implies a collision; NaN without rows."""
+    if "conflict_detected" not in given.rows:
+        return None
+    return float(given.rows["conflict_detected"].to_numpy(dtype=bool).mean()) if len(given.rows) else np.nan
+
+
+def passed(given: Given) -> Share | None:
+    """The rows in conflict that pass."""
+    if "conflict" not in given.rows:
+        return None
+    part = given.rows[given.rows["conflict"]]
+    return _share(part, part["braking_pass"].to_numpy(dtype=bool), given.seed, fixed=given.reaction_fixed)
+
+
+@dataclass(frozen=True)
+class Exact:
+    """What the runs tend to: every look counts the same, its rows of `exact.parquet` by their probability."""
+
+    share: float | None
+    times: Detections
+    missed: dict[str, float | None]
+
+
+def exact(given: Given) -> Exact | None:
+    """Statistics of `exact.parquet`.
+
+    Among n rows less than one is nobody: with censoring, a look that is still open with probability 10⁻⁹ would
+    otherwise stand for all that were censored before.
+    """
+    part = given.exact
+    if part is None:
+        return None
+    missed = _missed(part[part["detection_s"].isna()])
+    if not len(part):
+        return Exact(None, _detections(part, np.empty(0, dtype=bool), _DETECTION, None), missed)
+    part = part[part["probability"] > 0]
+    weight = part["probability"].to_numpy(dtype=float)
+    known = part["detection_s"].notna().to_numpy()
+    times = _detections(part, known, _DETECTION, given.horizon_s, weight, 1 / len(given.rows))
+    return Exact(weight[known].sum() / weight.sum(), times, missed)
+
+
+def _missed(never: pd.DataFrame) -> dict[str, float | None]:
+    """How probably a look misses its object, from the rows of `exact.parquet` for never: one per look.
+
+    In logarithms; the derivative by the log-odds of detection is that of the mean, so looks count by their share of it.
+    """
+    names = ("miss_log10", "miss_log10_half_odds")
+    if not never["miss_log10"].notna().any():
+        return dict.fromkeys((*names, "miss_per_logit"))
+    shares: dict[str, Float] = {}
+    row: dict[str, float | None] = {}
+    for name in names:
+        log10 = never[name].fillna(-np.inf).to_numpy(dtype=float)
+        shares[name] = np.power(10.0, log10 - log10.max())
+        row[name] = float(log10.max() + np.log10(shares[name].mean()))
+    weight, slope = shares["miss_log10"], never["miss_per_logit"].fillna(0.0).to_numpy(dtype=float)
+    return row | {"miss_per_logit": float(weight @ slope / weight.sum())}
+
+
+def judged(given: Given) -> tuple[float | None, float | None] | None:
+    """The shares that pass and that fail, of `exact.parquet`; too rare a failure to be resolved has no share."""
+    if given.exact is None or "conflict" not in given.exact:
+        return None
+    part = given.exact[given.exact["conflict"]]
+    if not len(part):
+        return None, None
+    weight = part["probability"].to_numpy(dtype=float)
+    passes, fails = (part[f"{name}_probability"].to_numpy(dtype=float) for name in ("pass", "fail"))
+    share = float(weight @ np.nan_to_num(fails) / weight.sum())
+    failed = None if share < UNRESOLVED and np.isnan(fails).any() else share
+    return float(weight @ passes / weight.sum()), failed
+
+
+def _itself(given: Given) -> Given:
+    return given
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def _limits(of: str, statistics: Callable[[Given], Share | None], prefix: str = "") -> tuple[Metric, ...]:
+    """Columns beside a share: its limits, of which kind they are, and over what."""
+    row = partial(Metric, statistics=statistics, better=0)
+    return (
+        row(f"{of}_low", value=attrgetter("low"), help=f"lower limit of {of}, 95 %"),
+        row(f"{of}_high", value=attrgetter("high"), help=f"upper limit of {of}, 95 %"),
+        row(f"{prefix}interval", value=attrgetter("kind"), help=f"of which kind the limits of {of} are"),
+        row(f"{prefix}interval_over", value=attrgetter("over"), help=f"what is resampled for the limits of {of}"),
+    )
+
+
+_DISTANCE = "distance at detection, centre to centre: half were farther away; never detected ranks below every distance"
+_PASSES = "of those, how many the declared driver, braking when it knew, stays clear of, [95 % interval]"
+
+_DETECTION_METRICS = (
+    Metric("n", _itself, lambda of: len(of.rows), 0, "rows: runs × measured objects × logs", "summary"),
+    Metric("list_rate_hz", _itself, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary"),
+    Metric("detected_share", detected, lambda of: of.share, 1,
+           "share of the rows that were detected, [95 % interval]", "summary", "share detected"),
+    *_limits("detected_share", detected),
+    Metric("ttd_p5_s", detections, lambda of: of.quantile_s(0.05), -1, "time by which 5 % were detected"),
+    Metric("ttd_median_s", detections, lambda of: of.quantile_s(0.5), -1,
+           "time to detection: by then half were detected", "summary"),
+    Metric("ttd_p95_s", detections, lambda of: of.quantile_s(0.95), -1,
+           "by then 95 % were; a dash: that many never were", "summary"),
+    Metric("ttd_rmst_s", detections, lambda of: of.mean_s(), -1,
+           "mean time to detection, never detected counting as the horizon", "summary",
+           "mean time to detection, never detected counting as the horizon"),
+    Metric("ttd_rmst_horizon_s", detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
+    Metric("dad_median_m", detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
+           "median of the differences of distances at detection"),
+    Metric("dad_p5_m", detections, lambda of: of.distance_quantile_m(0.05), 1, "95 % were farther away", "summary"),
+)  # fmt: skip
+
+_CONFLICT_METRICS = (
+    Metric("conflict_detected_share", foreseen, _number, 1,
+           "share of the rows in which a list implied a collision", "conflict"),
+    Metric("conflict_ttd_median_s", conflicts, lambda of: of.quantile_s(0.5), -1, "by then half had one", "conflict"),
+    Metric("conflict_ttd_p95_s", conflicts, lambda of: of.quantile_s(0.95), -1, "by then 95 % had", "conflict"),
+    Metric("conflict_ttd_rmst_s", conflicts, lambda of: of.mean_s(), -1,
+           "mean time, never counting as the horizon", "conflict"),
+    Metric("conflict_dad_median_m", conflicts, lambda of: of.distance_quantile_m(0.5), 1,
+           "distance then: half were farther away", "conflict"),
+)  # fmt: skip
+
+_BRAKING_METRICS = (
+    Metric("n_conflict", passed, lambda of: of.n, 0,
+           "rows in which the ego, not braking, would come too near", "braking"),
+    Metric("pass_share", passed, lambda of: of.share, 1, _PASSES, "braking", "share that passes, of those in conflict"),
+    *_limits("pass_share", passed, "pass_"),
+)  # fmt: skip
+
+
+def _exact_metric(name: str, value: Callable[[Exact], float | None], better: Literal[-1, 0, 1]) -> Metric:
+    return Metric(f"{name}_exact", exact, value, better, f"what {name} of the runs tends to")
+
+
+def _exact_missed(name: str, help: str) -> Metric:
+    find = itemgetter(name)
+    return Metric(name, exact, lambda of: find(of.missed), -1, help)
+
+
+_EXACT_METRICS = (
+    _exact_metric("detected_share", lambda of: of.share, 1),
+    _exact_metric("ttd_p5_s", lambda of: of.times.quantile_s(0.05), -1),
+    _exact_metric("ttd_median_s", lambda of: of.times.quantile_s(0.5), -1),
+    _exact_metric("ttd_p95_s", lambda of: of.times.quantile_s(0.95), -1),
+    _exact_metric("ttd_rmst_s", lambda of: of.times.mean_s(), -1),
+    _exact_metric("dad_median_m", lambda of: of.times.distance_quantile_m(0.5), 1),
+    _exact_metric("dad_p5_m", lambda of: of.times.distance_quantile_m(0.05), 1),
+    _exact_missed("miss_log10", "log₁₀ of the mean probability that a look misses its object"),
+    _exact_missed("miss_log10_half_odds", "the same with the odds of every detection halved"),
+    _exact_missed("miss_per_logit", "d ln of that probability by the log-odds of every detection"),
+    Metric("pass_share_exact", judged, itemgetter(0), 1, "the same without a draw", "braking"),
+    Metric("fail_share_exact", judged, itemgetter(1), -1, "share that fails, without a draw; null below 10⁻¹⁵"),
+)
+
+METRICS: tuple[Metric, ...] = (
+    *_DETECTION_METRICS, *_CONFLICT_METRICS, *_BRAKING_METRICS, *ACCURACY, *_EXACT_METRICS,
+)  # fmt: skip
+"""All built-in metrics, in the order of the columns."""
+METRIC: dict[str, Metric] = {metric.name: metric for metric in METRICS}
+
+PARTS = {
+    "summary": "When, and how far away",
+    "braking": "Braking in time",
+    "conflict": "When the collision was foreseen",
+    "accuracy": "How far off",
+    "own": "Own metrics",
+}
+"""Tables that metrics are shown in, and their captions."""
