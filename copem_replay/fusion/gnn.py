@@ -20,19 +20,19 @@ from copem_replay.fusion.union import run_after_run
 class Gnn(ListFusion):
     """Every unit's newest list associated and combined anew at each instant: nothing is remembered or predicted.
 
-    List after list, newest capture first, the entries are assigned to the clusters so far at least total cost
-    d² + ln|S|, S = P_cluster + P_entry, where d² = νᵀS⁻¹ν is within `gate` (the share of true pairs inside: χ², two
-    degrees of freedom) and the classes agree; whoever is left founds a cluster. No unit is twice in one. The members'
-    positions are combined by `combine`: inverse variance (independent errors) or covariance intersection (any
-    correlation; of least trace or, `minimise`, determinant), in closed form if fast, which gives the best member
-    where that is better. Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height, velocity, size and yaw
-    (on the circle) the mean by inverse trace of the position covariance. Source: S. Blackman, R. Popoli, "Design and
-    Analysis of Modern Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py, and for the running
-    state by which intersecting clusters are compared W. Niehsen, "Information fusion based on fast covariance
-    intersection filtering", FUSION 2002. Assumes Gaussian position errors of the stated covariance without bias, and
-    lists of about one instant. A stale list of a moving object, a biased unit or too small a covariance leaves it as a
-    duplicate; objects closer than the gate may swap or merge members; units that repeat each other are counted as
-    often as they speak, unless covariances are intersected; existence always is.
+    List after list, newest capture first, the entries are assigned to the clusters so far at least total cost d² +
+    ln|S|, S = P_cluster + P_entry, where d² = νᵀS⁻¹ν is within `gate` (the share of true pairs inside: χ², two degrees
+    of freedom) and the classes agree; whoever is left founds a cluster. No unit is twice in one. The members' positions
+    are combined by `combine`: inverse variance (independent errors) or covariance intersection (any correlation; of
+    least trace or, `minimise`, determinant), in closed form if fast, which gives the best member where that is better.
+    Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height, velocity, size and yaw (on the circle) the
+    mean by inverse trace of the position covariance. Source: S. Blackman, R. Popoli, "Design and Analysis of Modern
+    Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py, and for the running state by which
+    intersecting clusters are compared W. Niehsen, "Information fusion based on fast covariance intersection filtering",
+    FUSION 2002. Assumes Gaussian position errors of the stated covariance without bias, and lists of about one instant.
+    A stale list of a moving object, a biased unit or too small a covariance leaves it as a duplicate; objects closer
+    than the gate may swap or merge members; units that repeat each other are counted as often as they speak, unless
+    covariances are intersected; existence always is.
     """
 
     kind: Literal["gnn"] = "gnn"

@@ -124,7 +124,8 @@ def test_the_kit_asks_for_it_too() -> None:
 
 
 def plainly(entries: Entries, places: Sequence[dict[int, tuple[float, float]]], classes: list[str]) -> Any:
-    """One list by the rules of `metrics/matching.py`; `places`: by entry, who is where at the instant it is asked about."""
+    """One list by the rules of `metrics/matching.py`; `places`: by entry, who is where at the instant it is asked
+    about."""
 
     def within(i: int, free: set[int]) -> list[int]:
         e = entries[i]
