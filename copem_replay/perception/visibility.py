@@ -23,7 +23,7 @@ from pydantic_core import PydanticKnownError
 from copem_replay.core.components import Component, Slot, asked, wrong
 from copem_replay.core.own_code import is_own
 from copem_replay.core.tracks import Bool, Float, Int, Tracks
-from copem_replay.perception.visibility_kernel import views
+from copem_replay.perception.visibility_kernel import Boxes, Obstacles, Places, views
 
 _ROWS_PER_THREAD = 20_000
 """Below this many views a thread costs more than it brings (chosen)."""
@@ -228,18 +228,21 @@ def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, 
     if not len(order):
         return out, blocker
     z, half = world.z_m[0, order], world.height_m[0, order] / 2
-    arrays = (
-        bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order],
-        static.xy_m, static.start, static.body, static.bottom_m, static.top_m,
-        np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present), observers.carrier_ix, flat,
-    )  # fmt: skip
+    boxes = Boxes(bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order])
+    obstacles = Obstacles(static.xy_m, static.start, static.body, static.bottom_m, static.top_m)
+    place_m, present = np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present)
+    places = Places(place_m, present, observers.carrier_ix)
     threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
     cuts = np.searchsorted(bounds, np.linspace(0, len(order), pieces + 1)[1:-1])
     edges = [0, *sorted(int(c) for c in cuts), n_frames]
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda k: views(edges[k], edges[k + 1], *arrays, out, blocker), range(pieces)))
+        list(
+            pool.map(
+                lambda k: views(edges[k], edges[k + 1], boxes, obstacles, places, flat, out, blocker), range(pieces)
+            )
+        )
     return out, blocker
 
 

@@ -10,12 +10,67 @@ All in one file, because Numba's cache on disk only notices changes in the file 
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numba as nb
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
 
 Work = tuple[Float, Float, Float, Float, Float, Float, Float]
+
+
+class Boxes(NamedTuple):
+    """The objects: rows P list by list, `bounds (F + 1,)` their starts."""
+
+    bounds: Int
+    corners_m: Float  # (P, 4, 2)
+    bottom_m: Float  # (P,)
+    top_m: Float
+    object_ix: Int
+
+
+class Obstacles(NamedTuple):
+    """Convex parts of static obstacles, see `Statics`."""
+
+    xy_m: Float
+    start: Int
+    body: Int
+    bottom_m: Float
+    top_m: Float
+
+
+class Places(NamedTuple):
+    """Where units are at each list, see `Observers`."""
+
+    place_m: Float
+    present: Bool
+    carrier_ix: Int
+
+
+class Columns(NamedTuple):
+    """Columns of a target's face between two azimuths `a` and `b`, (ux, uy) half way between them."""
+
+    a: float
+    b: float
+    ux: float
+    uy: float
+    face: float  # distance along (ux, uy)
+    tx: float
+    ty: float
+    z0: float
+    z1: float
+
+
+BODY = np.dtype(
+    [
+        ("size", np.int64), ("owner", np.int64), ("x_m", np.float64), ("y_m", np.float64), ("radius_m", np.float64),
+        ("bottom_m", np.float64), ("top_m", np.float64),
+        ("bearing", np.float64), ("distance_m", np.float64), ("lo", np.float64), ("hi", np.float64),
+    ]
+)  # fmt: skip
+"""A body: how many corners it has; the obstacle it is a part of, −1: none; middle, radius and height. From one
+observer: bearing and distance of the middle, and the extent in azimuth about it."""
 
 _OVERLAP_M = 1e-6
 """Footprints that enter each other by less than this only touch (chosen)."""
@@ -27,15 +82,16 @@ _MAX_PIECES = 512
 
 @nb.njit(cache=True, nogil=True)
 def views(
-    f0: int, f1: int, bounds: Int, corners: Float, bottom: Float, top: Float, object_ix: Int,
-    static_xy: Float, static_start: Int, static_body: Int, static_bottom: Float, static_top: Float,
-    observer_m: Float, present: Bool, carrier_ix: Int, flat: bool, out: Float, blocker: Int,
-) -> None:  # fmt: skip
-    """Visible shares `out (U, P)` of the lists f0 … f1 − 1; rows P list by list, `bounds (F + 1,)` their starts.
+    f0: int, f1: int, boxes: Boxes, obstacles: Obstacles, places: Places, flat: bool, out: Float, blocker: Int
+) -> None:
+    """Visible shares `out (U, P)` of the lists f0 … f1 − 1.
 
     `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
     hides any of it, −2 − k for the obstacle k.
     """
+    bounds, corners, bottom, top, object_ix = boxes
+    static_xy, static_start, static_body, static_bottom, static_top = obstacles
+    observer_m, present, carrier_ix = places
     # Bodies of one list: the boxes first, then the static parts. Everything below is relative to the observer.
     n_static = len(static_body)
     most = n_static
@@ -45,13 +101,7 @@ def views(
     for g in range(n_static):
         widest = max(widest, static_start[g + 1] - static_start[g])
     xy = np.empty((most, widest, 2))
-    size = np.empty(most, dtype=np.int64)
-    middle = np.empty((most, 2))
-    radius = np.empty(most)
-    zlo, zhi = np.empty(most), np.empty(most)
-    owner = np.empty(most, dtype=np.int64)
-    # From one observer: bearing and distance of the middle, extent in azimuth, whether it can hide anything.
-    bearing, distance, lo, hi = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
+    of = np.empty(most, BODY)
     hides, inside = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
     near, alone = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
     work = _workspace(most, widest)
@@ -62,44 +112,44 @@ def views(
         bodies = n + n_static
         for b in range(bodies):
             if b < n:
-                size[b], owner[b] = 4, -1
-                zlo[b], zhi[b] = bottom[first + b], top[first + b]
+                of[b].size, of[b].owner = 4, -1
+                of[b].bottom_m, of[b].top_m = bottom[first + b], top[first + b]
                 for k in range(4):
                     xy[b, k, 0], xy[b, k, 1] = corners[first + b, k, 0], corners[first + b, k, 1]
             else:
                 g = b - n
-                size[b], owner[b] = static_start[g + 1] - static_start[g], static_body[g]
-                zlo[b], zhi[b] = static_bottom[g], static_top[g]
-                for k in range(size[b]):
+                of[b].size, of[b].owner = static_start[g + 1] - static_start[g], static_body[g]
+                of[b].bottom_m, of[b].top_m = static_bottom[g], static_top[g]
+                for k in range(of[b].size):
                     v = static_start[g] + k
                     xy[b, k, 0], xy[b, k, 1] = static_xy[v, 0], static_xy[v, 1]
             mx = my = r2 = 0.0
-            for k in range(size[b]):
-                mx += xy[b, k, 0] / size[b]
-                my += xy[b, k, 1] / size[b]
-            for k in range(size[b]):
+            for k in range(of[b].size):
+                mx += xy[b, k, 0] / of[b].size
+                my += xy[b, k, 1] / of[b].size
+            for k in range(of[b].size):
                 r2 = max(r2, (xy[b, k, 0] - mx) ** 2 + (xy[b, k, 1] - my) ** 2)
-            middle[b, 0], middle[b, 1], radius[b] = mx, my, np.sqrt(r2)
+            of[b].x_m, of[b].y_m, of[b].radius_m = mx, my, np.sqrt(r2)
 
         for u in range(present.shape[0]):
             if not present[u, f]:
                 continue
             ox, oy, oz = observer_m[u, f, 0], observer_m[u, f, 1], observer_m[u, f, 2]
             for b in range(bodies):
-                inside[b] = _contains(xy[b], size[b], ox, oy)
+                inside[b] = _contains(xy[b], of[b].size, ox, oy)
                 hides[b] = not inside[b] and not (b < n and object_ix[first + b] == carrier_ix[u])
-                dx, dy = middle[b, 0] - ox, middle[b, 1] - oy
-                bearing[b], distance[b] = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
-                lo[b] = hi[b] = 0.0
+                dx, dy = of[b].x_m - ox, of[b].y_m - oy
+                of[b].bearing, of[b].distance_m = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
+                of[b].lo = of[b].hi = 0.0
                 if hides[b]:
-                    for k in range(size[b]):
+                    for k in range(of[b].size):
                         vx, vy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
                         angle = np.arctan2(dx * vy - dy * vx, dx * vx + dy * vy)
-                        lo[b], hi[b] = min(lo[b], angle), max(hi[b], angle)
+                        of[b].lo, of[b].hi = min(of[b].lo, angle), max(of[b].hi, angle)
             for b in range(n, bodies):  # inside one part of an obstacle is inside the obstacle
                 if inside[b]:
                     for c in range(n, bodies):
-                        if owner[c] == owner[b]:
+                        if of[c].owner == of[b].owner:
                             hides[c] = False
             for t in range(n):
                 if object_ix[first + t] == carrier_ix[u]:
@@ -109,59 +159,54 @@ def views(
                     continue
                 count = 0
                 for b in range(bodies):
-                    if b == t or not hides[b] or distance[b] - radius[b] > distance[t] + radius[t]:
+                    if b == t or not hides[b] or of[b].distance_m - of[b].radius_m > of[t].distance_m + of[t].radius_m:
                         continue
-                    turn = bearing[b] - bearing[t]
+                    turn = of[b].bearing - of[t].bearing
                     turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
                     if (
-                        (turn + lo[b] < hi[t] and turn + hi[b] > lo[t])
-                        or turn + hi[b] - 2 * np.pi > lo[t]
-                        or turn + lo[b] + 2 * np.pi < hi[t]
+                        (turn + of[b].lo < of[t].hi and turn + of[b].hi > of[t].lo)
+                        or turn + of[b].hi - 2 * np.pi > of[t].lo
+                        or turn + of[b].lo + 2 * np.pi < of[t].hi
                     ):
                         near[count] = b
                         count += 1
-                count = _drop_overlapping(t, near, count, xy, size, middle, radius, owner)
+                count = _drop_overlapping(t, near, count, xy, of)
                 if count == 0:
                     out[u, first + t] = 1.0
-                elif _hidden_by_one(t, near, count, distance, radius, bearing, lo, hi, zlo, zhi, oz, flat):
+                elif _hidden_by_one(t, near, count, of, oz, flat):
                     out[u, first + t] = 0.0
                 else:
-                    out[u, first + t] = _share(
-                        t, near, count, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work
-                    )
+                    out[u, first + t] = _share(t, near, count, xy, of, (ox, oy, oz), flat, work)
                 if blocker.shape[0] == 0:
                     continue
                 least = 1.0 - 1e-9
                 for i in range(count):
                     alone[0] = near[i]
-                    left = _share(t, alone, 1, xy, size, zlo, zhi, ox, oy, oz, bearing[t], lo[t], hi[t], flat, work)
+                    left = _share(t, alone, 1, xy, of, (ox, oy, oz), flat, work)
                     if left < least:
                         least = left
-                        blocker[u, first + t] = first + near[i] if near[i] < n else -2 - owner[near[i]]
+                        blocker[u, first + t] = first + near[i] if near[i] < n else -2 - of[near[i]].owner
 
 
 @nb.njit(cache=True, nogil=True)
-def _hidden_by_one(
-    t: int, near: Int, count: int, distance: Float, radius: Float, bearing: Float, lo: Float, hi: Float,
-    zlo: Float, zhi: Float, oz: float, flat: bool,
-) -> bool:  # fmt: skip
+def _hidden_by_one(t: int, near: Int, count: int, of: Any, oz: float, flat: bool) -> bool:
     # Whether one body surely hides all of target t, by bounds alone: what `_share` would find, in far less time.
-    nearest, farthest = distance[t] - radius[t], distance[t] + radius[t]
-    z0, z1 = zlo[t] - oz, zhi[t] - oz
+    nearest, farthest = of[t].distance_m - of[t].radius_m, of[t].distance_m + of[t].radius_m
+    z0, z1 = of[t].bottom_m - oz, of[t].top_m - oz
     lowest = z0 / nearest if z0 < 0.0 else z0 / farthest  # slopes between which the target is
     highest = z1 / nearest if z1 > 0.0 else z1 / farthest
     for i in range(count):
         b = near[i]
-        begins, ends = distance[b] - radius[b], distance[b] + radius[b]
+        begins, ends = of[b].distance_m - of[b].radius_m, of[b].distance_m + of[b].radius_m
         if begins <= _SURELY or ends + _SURELY >= nearest:
             continue
-        turn = bearing[b] - bearing[t]
+        turn = of[b].bearing - of[t].bearing
         turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
-        if turn + lo[b] + _SURELY >= lo[t] or turn + hi[b] - _SURELY <= hi[t]:
+        if turn + of[b].lo + _SURELY >= of[t].lo or turn + of[b].hi - _SURELY <= of[t].hi:
             continue
         if flat:
             return True
-        bottom, top = zlo[b] - oz, zhi[b] - oz
+        bottom, top = of[b].bottom_m - oz, of[b].top_m - oz
         from_slope = bottom / ends if bottom < 0.0 else bottom / begins
         to_slope = top / ends if top > 0.0 else top / begins
         if from_slope + _SURELY < lowest and to_slope - _SURELY > highest:
@@ -197,31 +242,29 @@ def _separated(a: Float, na: int, b: Float, nb_: int) -> bool:
 
 
 @nb.njit(cache=True, nogil=True)
-def _drop_overlapping(
-    t: int, near: Int, count: int, xy: Float, size: Int, middle: Float, radius: Float, owner: Int
-) -> int:
+def _drop_overlapping(t: int, near: Int, count: int, xy: Float, of: Any) -> int:
     # A body that overlaps the target's footprint does not hide it; one part that overlaps frees the whole obstacle.
     kept = 0
     freed = -1
     for i in range(count):
         b = near[i]
-        dx, dy, reach = middle[b, 0] - middle[t, 0], middle[b, 1] - middle[t, 1], radius[b] + radius[t]
+        dx, dy, reach = of[b].x_m - of[t].x_m, of[b].y_m - of[t].y_m, of[b].radius_m + of[t].radius_m
         overlaps = (
             dx * dx + dy * dy < reach * reach
-            and not _separated(xy[t], size[t], xy[b], size[b])
-            and not _separated(xy[b], size[b], xy[t], size[t])
+            and not _separated(xy[t], of[t].size, xy[b], of[b].size)
+            and not _separated(xy[b], of[b].size, xy[t], of[t].size)
         )
         if not overlaps:
             near[kept] = b
             kept += 1
-        elif owner[b] >= 0:
-            freed = owner[b]
+        elif of[b].owner >= 0:
+            freed = of[b].owner
             for j in range(i + 1, count):  # the parts still to come …
-                if owner[near[j]] == freed:
+                if of[near[j]].owner == freed:
                     near[j] = t  # … marked: the target never hides itself
             back = 0
             for j in range(kept):  # … and those already kept
-                if owner[near[j]] != freed:
+                if of[near[j]].owner != freed:
                     near[back] = near[j]
                     back += 1
             kept = back
@@ -299,36 +342,36 @@ def _equal_at(
 
 @nb.njit(cache=True, nogil=True)
 def _share(
-    t: int, near: Int, count: int, xy: Float, size: Int, zlo: Float, zhi: Float,
-    ox: float, oy: float, oz: float, bearing: float, lo: float, hi: float, flat: bool, work: Work,
-) -> float:  # fmt: skip
+    t: int, near: Int, count: int, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool, work: Work
+) -> float:
     # The share of target t that the bodies near[:count] leave visible: the open azimuths, column by column.
     local, breaks, begin, end, splits, low, high = work
+    ox, oy, oz = eye_m
+    bearing, lo, hi = of[t].bearing, of[t].lo, of[t].hi
     cos, sin = np.cos(bearing), np.sin(bearing)
     n_breaks = _insert(breaks, 0, lo)
     n_breaks = _insert(breaks, n_breaks, hi)
     for i in range(count + 1):  # the target last
         b = near[i] if i < count else t
-        for k in range(size[b]):
+        for k in range(of[b].size):
             dx, dy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
             vx, vy = cos * dx + sin * dy, cos * dy - sin * dx
             local[i, k, 0], local[i, k, 1] = vx, vy
             angle = np.arctan2(vy, vx)
             if lo < angle < hi:
                 n_breaks = _insert(breaks, n_breaks, angle)
-    z0, z1 = zlo[t] - oz, zhi[t] - oz
+    z0, z1 = of[t].bottom_m - oz, of[t].top_m - oz
     seen = 0.0
     for piece in range(n_breaks - 1):
         a, b = breaks[piece], breaks[piece + 1]
         if b - a < 1e-12:
             continue
         ux, uy = np.cos((a + b) / 2), np.sin((a + b) / 2)
-        hit, face, tx, ty, _fx, _fy = _faces(local[count], size[t], ux, uy)
+        hit, face, tx, ty, _fx, _fy = _faces(local[count], of[t].size, ux, uy)
         if not hit:  # rounding at a grazing corner
             continue
-        active = _active(
-            near, count, local, size, zlo, zhi, oz, ux, uy, face, tx, ty, z0, z1, a, b, flat, begin, end
-        )  # fmt: skip
+        columns = Columns(a, b, ux, uy, face, tx, ty, z0, z1)
+        active = _active(near, count, local, of, oz, columns, flat, begin, end)
         if active == 0:
             seen += b - a
         elif active > 0:
@@ -346,22 +389,22 @@ def _share(
 
 @nb.njit(inline="always")
 def _active(
-    near: Int, count: int, local: Float, size: Int, zlo: Float, zhi: Float, oz: float, ux: float, uy: float,
-    face: float, tx: float, ty: float, z0: float, z1: float, a: float, b: float, flat: bool, begin: Float, end: Float,
-) -> int:  # fmt: skip
+    near: Int, count: int, local: Float, of: Any, oz: float, columns: Columns, flat: bool, begin: Float, end: Float
+) -> int:
     # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in begin and end.
     # −1 where one of them covers all of it. Linear in u: what holds at both ends holds throughout.
+    a, b, ux, uy, face, tx, ty, z0, z1 = columns
     cos_a, sin_a, cos_b, sin_b = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
     tx0, ty0, tx1, ty1 = z0 * tx, z0 * ty, z1 * tx, z1 * ty
     active = 0
     for i in range(count):
         body = near[i]
-        hit, enter, nx, ny, fx, fy = _faces(local[i], size[body], ux, uy)
+        hit, enter, nx, ny, fx, fy = _faces(local[i], of[body].size, ux, uy)
         if not hit or enter >= face:
             continue
         if flat:
             return -1
-        bottom, top = zlo[body] - oz, zhi[body] - oz
+        bottom, top = of[body].bottom_m - oz, of[body].top_m - oz
         # It begins to cover at its lower edge: the near one where that is below the eyes, else the far one.
         bx, by = (bottom * nx, bottom * ny) if bottom < 0.0 else (bottom * fx, bottom * fy)
         ex, ey = (top * nx, top * ny) if top > 0.0 else (top * fx, top * fy)
