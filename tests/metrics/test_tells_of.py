@@ -92,7 +92,8 @@ def test_a_capture_is_that_of_a_list_that_has_arrived(claims: str) -> None:
 
 
 def test_another_one_is_an_error_of_the_class_at_its_line() -> None:
-    said = r"^configurations.mine.fusion: tests.metrics.test_tells_of:Own: captured_s: expected the capture of a list that has arrived, "
+    said = r"^configurations.mine.fusion: tests.metrics.test_tells_of:Own: captured_s: "
+    said += "expected the capture of a list that has arrived, "
     with pytest.raises(InputError, match=said + r"found 0\.4 s \(.*test_tells_of\.py:\d+\)$") as caught:
         fused_by(Own(claims="now"), told(), "configurations.mine.fusion")
     line = int(re.findall(r":(\d+)\)$", str(caught.value))[0])

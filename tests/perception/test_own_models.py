@@ -186,7 +186,8 @@ def test_a_step_that_gives_something_else_is_named() -> None:
         "own": {"units": ["ego"], "fusion": {"kind": "tests.perception.test_own_models:Number"}},
     }
     wrong = scenes.experiment(configurations=own)
-    said = r"^configurations\.own\.fusion: tests.perception.test_own_models:Number: .*step: expected a list and a memory, found int"
+    said = r"^configurations\.own\.fusion: tests.perception.test_own_models:Number: "
+    said += ".*step: expected a list and a memory, found int"
     said += rf" \(.*test_own_models\.py:{line_of('# the step')}\)$"
     with pytest.raises(InputError, match=said):
         believed(prepare(scenes.oncoming_car(), wrong), wrong, 0)

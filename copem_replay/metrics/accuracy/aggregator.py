@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from copem_replay.core.object_list import Lists
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Scene, Tracks
 from copem_replay.metrics.accuracy.kernel import Asked, Found, SoFar, Stays, Sums, World, add_up, close
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, EXISTENCE_BINS, OBJECT, RUN, Accuracy, Settings
-from copem_replay.metrics.episodes import Looks
 from copem_replay.metrics.matching import Matches
 from copem_replay.metrics.reference import Reference
+
+if TYPE_CHECKING:
+    from copem_replay.metrics.episodes import Looks
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 

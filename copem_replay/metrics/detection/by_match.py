@@ -12,6 +12,7 @@ never. `Steps` says when, for every existence.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,8 +21,10 @@ from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_match_kernel import HELD, levels
 from copem_replay.metrics.detection.by_truth_id import Detections, capture_instants
-from copem_replay.metrics.episodes import Looks
 from copem_replay.metrics.matching import Matches
+
+if TYPE_CHECKING:
+    from copem_replay.metrics.episodes import Looks
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 _FOUND = np.dtype(
