@@ -19,7 +19,7 @@ import numpy as np
 from copem_replay.core.object_list import Entries, Lists
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
-from copem_replay.metrics.detection.by_match_kernel import HELD, levels
+from copem_replay.metrics.detection.by_match_kernel import HELD, Matched, Stays, levels
 from copem_replay.metrics.detection.by_truth_id import Detections, capture_instants
 from copem_replay.metrics.matching import Matches
 
@@ -76,10 +76,10 @@ class FirstMatches:
 
     def __init__(self, looks: Looks, *, runs: int, confirm: Confirm, count_earlier: bool, captures: Captures) -> None:
         count = len(looks.object_ix)
-        self._look_of = np.full(int(looks.object_ix.max(initial=-1)) + 1, -1)
-        self._look_of[looks.object_ix] = np.arange(count)
-        self._not_before_s = np.full(count, -np.inf) if count_earlier else looks.onset_s - _TOLERANCE_S
-        self._until_s = looks.ended_s + _TOLERANCE_S
+        look_of = np.full(int(looks.object_ix.max(initial=-1)) + 1, -1)
+        look_of[looks.object_ix] = np.arange(count)
+        not_before_s = np.full(count, -np.inf) if count_earlier else looks.onset_s - _TOLERANCE_S
+        self._stays = Stays(look_of, not_before_s, looks.ended_s + _TOLERANCE_S)
         self._confirm, self._captures = confirm, captures
         # Captures are numbered: the instants, which are nobody's, then the lists, each its unit's.
         self._instants = int(captures.instant.max(initial=-1)) + 1
@@ -97,14 +97,14 @@ class FirstMatches:
             source[source[:, 1] >= 0, 1] += self._instants
         level = np.full(len(lists.entries), np.nan)
         self._held = levels(
-            lists.start, lists.entries, matches.object_ix, matches.role, issue_s, source, self._group, self._look_of,
-            self._not_before_s, self._until_s, self._confirm.hits, self._confirm.of, self._best, self._held, level,
+            Matched(lists.start, lists.entries, matches.object_ix, matches.role, issue_s), self._stays,
+            source, self._group, self._confirm.hits, self._confirm.of, self._best, self._held, level,
         )  # fmt: skip
         entry = np.flatnonzero(~np.isnan(level))
         # Of empty lists, which begin where the next does, the last is the one that holds the entry.
         run_ix, number = np.divmod(np.searchsorted(lists.start.ravel(), entry, side="right") - 1, lists.start.shape[1])
         found = np.empty(len(entry), dtype=_FOUND)
-        found["run_ix"], found["look_ix"] = run_ix, self._look_of[matches.object_ix[entry]]
+        found["run_ix"], found["look_ix"] = run_ix, self._stays.look_of[matches.object_ix[entry]]
         found["existence"], found["detection_s"] = level[entry], issue_s[number]
         found["captured_s"], found["unit_ix"] = lists.entries["captured_s"][entry], lists.entries["unit_ix"][entry]
         self._found.append(found)

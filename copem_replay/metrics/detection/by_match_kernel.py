@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -16,10 +16,27 @@ HELD = np.dtype([("run_ix", "i8"), ("look_ix", "i8"), ("capture", "i8"), ("exist
 """With which existence, the highest there was, a capture holds the object of a look."""
 
 
+class Matched(NamedTuple):
+    """Lists of S runs and what their entries are about, as `Lists` and `Matches`. `issue_s (K,)`: when available."""
+
+    start: Int  # (S, K + 1)
+    entries: Entries  # (N,)
+    object_ix: Int  # (N,)
+    role: NDArray[np.int8]  # (N,)
+    issue_s: Float  # (K,)
+
+
+class Stays(NamedTuple):
+    """Looks by object, −1: none, and from which capture until which list each counts."""
+
+    look_of: Int  # (C,)
+    not_before_s: Float  # (M,)
+    until_s: Float  # (M,)
+
+
 @nb.njit(cache=True, nogil=True)
 def levels(
-    start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, source: Int, group: Int,
-    look_of: Int, not_before_s: Float, until_s: Float, hits: int, of: int, best: Float, held: NDArray[Any],
+    lists: Matched, stays: Stays, source: Int, group: Int, hits: int, of: int, best: Float, held: NDArray[Any],
     level: Float,
 ) -> NDArray[Any]:  # fmt: skip
     """At each entry that makes an object known at a higher existence than before: that existence, in `level (N,)`.
@@ -29,6 +46,7 @@ def levels(
     it is after these lists. A capture that holds an object no more surely than it is known makes it no surer: whatever
     it would confirm, the same number of hits has confirmed already.
     """
+    start, entries, role = lists.start, lists.entries, lists.role
     S, M = best.shape
     most = 0
     for s in range(S):
@@ -40,10 +58,7 @@ def levels(
     within = np.empty(of)
     left, kept, h = np.empty(len(held), HELD), 0, 0
     for s in range(S):
-        _by_look(
-            start[s], entries, object_ix, role, issue_s, look_of, not_before_s, until_s, hits > 1, look, first, row,
-            number,
-        )  # fmt: skip
+        _by_look(s, lists, stays, hits > 1, look, first, row, number)
         for m in range(M):
             n = 0
             while h < len(held) and held[h].run_ix == s and held[h].look_ix == m:
@@ -89,10 +104,11 @@ def levels(
 
 @nb.njit(cache=True, nogil=True)
 def _by_look(
-    start: Int, entries: Entries, object_ix: Int, role: NDArray[np.int8], issue_s: Float, look_of: Int,
-    not_before_s: Float, until_s: Float, duplicates: bool, look: Int, first: Int, row: Int, number: Int,
-) -> None:  # fmt: skip
-    # The entries of one run that count, look by look and in each list by list: `row`, and `number` of its list.
+    s: int, lists: Matched, stays: Stays, duplicates: bool, look: Int, first: Int, row: Int, number: Int
+) -> None:
+    # The entries of run s that count, look by look and in each list by list: `row`, and `number` of its list.
+    start, entries, object_ix, role, issue_s = lists.start[s], lists.entries, lists.object_ix, lists.role, lists.issue_s
+    look_of, not_before_s, until_s = stays.look_of, stays.not_before_s, stays.until_s
     first[:] = 0
     for k in range(len(issue_s)):
         for i in range(start[k], start[k + 1]):

@@ -11,7 +11,7 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -51,12 +51,12 @@ def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool
     outdated_s = np.minimum(_superseded_s(heard)[heard.frame_ix], arrives_s + max_age_s + 2 * _TOLERANCE_S)
     # One hit confirms at once, whatever the instants.
     cluster = capture_instants(heard) if confirm.hits > 1 else np.zeros(len(heard.stamp_ns), dtype=np.int64)
-    _first(
-        heard.valid, order, bounds, arrives_s, captured_s, outdated_s, heard.row_unit_ix,
-        cluster[heard.frame_ix], heard.frame_ix, heard.frame_unit_ix,
-        not_before_s, found.ended_s + _TOLERANCE_S,
-        confirm.hits, confirm.of, out.detection_s, out.captured_s, out.first_unit_ix,
-    )  # fmt: skip
+    rows = _Rows(
+        heard.valid, arrives_s, captured_s, outdated_s, heard.row_unit_ix, cluster[heard.frame_ix], heard.frame_ix
+    )
+    stays = _Stays(order, bounds, not_before_s, found.ended_s + _TOLERANCE_S)
+    found_at = _Out(out.detection_s, out.captured_s, out.first_unit_ix)
+    _first(rows, heard.frame_unit_ix, stays, confirm.hits, confirm.of, found_at)
     return out
 
 
@@ -118,12 +118,37 @@ def _cluster(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: float, orde
         out[k] = last_of[unit_ix[k]] = current
 
 
+class _Rows(NamedTuple):
+    # Rows P of the lists that are heard; `outdated_s`: from then on the row counts no longer.
+    valid: Bool  # (S, P)
+    arrives_s: Float
+    captured_s: Float
+    outdated_s: Float
+    unit_ix: Int
+    cluster: Int  # the capture instant
+    frame_ix: Int
+
+
+class _Stays(NamedTuple):
+    # Look m: rows `order[bounds[m] : bounds[m + 1]]`, of captures and arrivals between these times.
+    order: Int
+    bounds: Int
+    not_before_s: Float
+    until_s: Float
+
+
+class _Out(NamedTuple):
+    # (S, M), written where an object is detected.
+    detection_s: Float
+    newest_s: Float
+    first_unit_ix: Int
+
+
 @nb.njit(cache=True, nogil=True)
-def _first(
-    valid: Bool, order: Int, bounds: Int, arrives_s: Float, captured_s: Float, outdated_s: Float, unit_ix: Int,
-    cluster: Int, frame_ix: Int, frame_unit_ix: Int, not_before_s: Float, until_s: Float, hits: int, of: int,
-    detection_s: Float, newest_s: Float, first_unit_ix: Int,
-) -> None:  # fmt: skip
+def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, out: _Out) -> None:
+    valid, arrives_s, captured_s, outdated_s, unit_ix, cluster, frame_ix = rows
+    order, bounds, not_before_s, until_s = stays
+    detection_s, newest_s, first_unit_ix = out
     held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
     nobody = np.zeros(len(frame_unit_ix), dtype=np.int64)
     # Which instants hold the object; a token per look and run spares clearing them.

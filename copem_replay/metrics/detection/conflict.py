@@ -7,6 +7,8 @@ it. Ways are compared, not times: nobody is expected to be exactly in time.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba as nb
 import numpy as np
 
@@ -45,8 +47,8 @@ class Foreseeing:
         issue_s = fused.arrives_s[0]
         pieces, bounds = corridors(self._ego, issue_s, self._wanted)
         implied = np.zeros(fused.valid.shape, dtype=np.bool_)
-        columns = (fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
-        _implied(fused.valid, *columns, fused.frame_ix, pieces, bounds, self._wanted.horizon_s, implied)
+        boxes = _Boxes(fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
+        _implied(fused.valid, boxes, fused.frame_ix, pieces, bounds, self._wanted.horizon_s, implied)
         newest_s = belief.captured_s
         track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
         for m, object_ix in enumerate(self._found.object_ix.tolist()):
@@ -118,11 +120,22 @@ def _cover(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pi
             piece[3], piece[4] = size[0] + high - low, size[1] + left - right
 
 
+class _Boxes(NamedTuple):
+    # Perceived states, all (S, P).
+    x_m: Float
+    y_m: Float
+    yaw_rad: Float
+    vx_mps: Float
+    vy_mps: Float
+    length_m: Float
+    width_m: Float
+
+
 @nb.njit(cache=True, nogil=True)
 def _implied(
-    valid: Bool, x: Float, y: Float, yaw: Float, vx: Float, vy: Float, length: Float, width: Float, frame_ix: Int,
-    pieces: Float, bounds: Int, horizon_s: float, out: Bool,
-) -> None:  # fmt: skip
+    valid: Bool, boxes: _Boxes, frame_ix: Int, pieces: Float, bounds: Int, horizon_s: float, out: Bool
+) -> None:
+    x, y, yaw, vx, vy, length, width = boxes
     for s in range(valid.shape[0]):
         for p in range(valid.shape[1]):
             if not valid[s, p]:
