@@ -76,9 +76,15 @@ def test_known_when_the_first_list_with_a_match_is_available() -> None:
     assert found(lists, [1.0, 2.0, 3.0])[0] == (2.0, 1.5, 2)
 
 
-def test_duplicates_ghosts_and_matches_of_others_are_no_match() -> None:
-    lists = [[Item(7, 1.0, role=DUPLICATE), Item(-1, 1.0, role=GHOST), Item(6, 1.0)], [Item(7, 2.0)]]
+def test_ghosts_and_matches_of_others_say_nothing_of_it() -> None:
+    lists = [[Item(-1, 1.0, role=GHOST), Item(6, 1.0)], [Item(7, 2.0)]]
     assert found(lists, [1.0, 2.0])[0] == (2.0, 2.0, 0)
+
+
+def test_a_newer_entry_beside_a_match_from_before_the_onset_makes_it_known() -> None:
+    """The first unit's entry is the match, however old it is; what the second one lists since the onset counts."""
+    lists = [[Item(7, 0.9, unit_ix=0), Item(7, 1.05, role=DUPLICATE, unit_ix=1)], [Item(7, 1.9, unit_ix=0)]]
+    assert found(lists, [1.1, 2.0])[0] == (1.1, 1.05, 1)
 
 
 def test_what_was_captured_before_the_onset_does_not_count() -> None:
@@ -225,8 +231,9 @@ def plainly(
 
     for k, one in enumerate(run):
         for e in one:
-            about = e.role == MATCH or (e.role == DUPLICATE and confirm.hits > 1)
-            counts = about and e.object_ix == object_ix and e.existence >= at_least and k <= look[1]
+            counts = (
+                e.role in (MATCH, DUPLICATE) and e.object_ix == object_ix and e.existence >= at_least and k <= look[1]
+            )
             if not counts or (e.captured_s < look[0] and not count_earlier):
                 continue
             if confirm.hits == 1:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from copem_replay.core.interpolation import states_at
@@ -91,6 +91,7 @@ def test_what_one_unit_detects_its_company_detects_too_and_not_later(
 
 
 @given(onset=onsets, confirm=confirms, ego_rate=rates, other_rate=rates, late=latencies, later=latencies)
+@example({"kind": "in_range", "range_m": 30}, {"hits": 1, "of": 1}, None, None, 0.05, 0.0)
 @MANY
 def test_where_nothing_can_be_confused_union_detects_as_ideal_does(
     onset: Any, confirm: Any, ego_rate: Any, other_rate: Any, late: float, later: float

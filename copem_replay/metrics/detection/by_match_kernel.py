@@ -58,7 +58,7 @@ def levels(
     within = np.empty(of)
     left, kept, h = np.empty(len(held), HELD), 0, 0
     for s in range(S):
-        _by_look(s, lists, stays, hits > 1, look, first, row, number)
+        _by_look(s, lists, stays, look, first, row, number)
         for m in range(M):
             n = 0
             while h < len(held) and held[h].run_ix == s and held[h].look_ix == m:
@@ -77,7 +77,7 @@ def levels(
                         standing = i
                     existence = entries[i].existence
                     if hits == 1:
-                        reached = existence
+                        reached = max(reached, existence)
                         continue
                     for c in source[i]:
                         if c < 0 or existence <= max(holds[c], best[s, m]):
@@ -103,16 +103,14 @@ def levels(
 
 
 @nb.njit(cache=True, nogil=True)
-def _by_look(
-    s: int, lists: Matched, stays: Stays, duplicates: bool, look: Int, first: Int, row: Int, number: Int
-) -> None:
+def _by_look(s: int, lists: Matched, stays: Stays, look: Int, first: Int, row: Int, number: Int) -> None:
     # The entries of run s that count, look by look and in each list by list: `row`, and `number` of its list.
     start, entries, object_ix, role, issue_s = lists.start[s], lists.entries, lists.object_ix, lists.role, lists.issue_s
     look_of, not_before_s, until_s = stays.look_of, stays.not_before_s, stays.until_s
     first[:] = 0
     for k in range(len(issue_s)):
         for i in range(start[k], start[k + 1]):
-            about = role[i] == MATCH or (duplicates and role[i] == DUPLICATE)
+            about = role[i] == MATCH or role[i] == DUPLICATE
             m = look_of[object_ix[i]] if about and object_ix[i] < len(look_of) else -1
             if m >= 0 and (issue_s[k] > until_s[m] or entries[i].captured_s < not_before_s[m]):
                 m = -1
