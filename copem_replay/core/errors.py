@@ -64,7 +64,7 @@ class RecordingError(InputError):
 
     >>> cr.read_recording("logs/tc016d.mcap", ego="99")
     Traceback (most recent call last):
-    copem_replay.core.errors.RecordingError: logs/tc016d.mcap: ego: no moving object '99'; there are 1 (car), ...
+    copem_replay.core.errors.EgoError: logs/tc016d.mcap: ego: no moving object '99'; there are 1 (car), ...
     """
 
     _about: str | None = None

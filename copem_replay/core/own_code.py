@@ -54,7 +54,7 @@ def _file_of(component: type[Any] | None) -> str | None:
         return None
 
 
-_MACHINERY = (f"{Path(__file__).parent}{os.sep}", f"{Path(importlib.__file__).parent}{os.sep}", "<frozen importlib")
+_MACHINERY = (f"{Path(__file__).parents[1]}{os.sep}", f"{Path(importlib.__file__).parent}{os.sep}", "<frozen importlib")
 
 
 def _is_machinery(file: str) -> bool:

@@ -55,7 +55,14 @@ class OnsetView:
 
 
 class Onset(Component, ABC):
-    """Base of onsets. The onset of an object is the first frame, with the ego in the log, at which `holds`."""
+    """Base of onsets. The onset of an object is the first frame, with the ego in the log, at which `holds`.
+
+    >>> class Fast(cr.Onset):
+    ...     def holds(self, view):
+    ...         return view.speed_mps > 15.0
+    >>> Fast(kind="my_package.onsets:Fast").label("car")
+    'Fast'
+    """
 
     requires: ClassVar[Requires] = Requires.NOTHING
     """What the experiment needs for this onset; `check` says where it lacks. A property of the class, no field."""

@@ -1,7 +1,7 @@
 """When did the receiver first know of an object? By match: for fusions that go without truth ids.
 
-Known by the first list that is available before looking ends and has an entry about the object (`metrics/matching.py`)
-that was captured at or after the onset: its match, or a duplicate, for the match of a union may be a unit's older entry.
+Known by the first list, available before looking ends, with an entry about the object (`metrics/matching.py`) that was
+captured at or after the onset: its match, or a duplicate, for the match of a union may be a unit's older entry.
 `confirm` counts captures, not messages, by the rules of `metrics/detection/by_truth_id.py`: an entry about the object
 says that the capture it goes back to holds it, however often it is issued again.
 
