@@ -91,13 +91,13 @@ def test_a_capture_is_that_of_a_list_that_has_arrived(claims: str) -> None:
     assert len(found.entries) == 1 + 1 + 2 + 2
 
 
-def test_another_one_is_an_error_of_the_class_at_its_line() -> None:
+def test_another_one_is_an_error_of_the_class_at_the_line_of_its_step() -> None:
     said = r"^configurations.mine.fusion: tests.metrics.test_tells_of:Own: captured_s: "
     said += "expected the capture of a list that has arrived, "
     with pytest.raises(InputError, match=said + r"found 0\.4 s \(.*test_tells_of\.py:\d+\)$") as caught:
         fused_by(Own(claims="now"), told(), "configurations.mine.fusion")
     line = int(re.findall(r":(\d+)\)$", str(caught.value))[0])
-    assert Path(__file__).read_text().splitlines()[line - 1].startswith("class Own(")
+    assert Path(__file__).read_text().splitlines()[line - 1].startswith("    def step(")
 
 
 def test_a_capture_that_has_not_arrived_yet_is_none() -> None:

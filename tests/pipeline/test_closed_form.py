@@ -551,7 +551,7 @@ class TestTails:
 
     def test_in_a_sweep(self) -> None:
         """What is later than 0.25 s leaves eight lists of eleven."""
-        sweep = run(masts(1, 0.9, sweep={"latency_s": [0.25]}), [one_walker()]).sweep
+        sweep = run(masts(1, 0.9, sweep={"configurations": ["all"], "latency_s": [0.25]}), [one_walker()]).sweep
         assert sweep is not None
         assert sweep["miss_log10"].tolist() == pytest.approx([-8], rel=1e-13)
         assert sweep["miss_per_logit"].tolist() == pytest.approx([-7.2], rel=1e-13)
