@@ -74,16 +74,17 @@ def summary(
 
 
 def _beyond_the_gate(accuracy: Mapping[str, Total]) -> list[str]:
-    """Where covariances as large as claimed have some errors that the gate lets not through."""
+    """Which configurations claim covariances so large that the gate cuts off some errors."""
     shares = {name: beyond_gate_share(of) or 0.0 for name, of in accuracy.items()}
     cut = {name: share for name, share in shares.items() if share >= MUCH_BEYOND}
     if not cut:
         return []
     gate_m = accuracy[next(iter(cut))].settings.gate_m
-    said = ", ".join(f"{name} {share:.2g}" for name, share in cut.items())
+    said = ", ".join(f"{name} {100 * share:.2g} %" for name, share in cut.items())
     return [
-        f"of errors as the claimed covariances have them this share is beyond the gate of {gate_m:g} m: {said}; it is "
-        "in no RMSE and no NEES, which is nees_expected, not 2, where covariances are true (`measure.match.gate_m`)"
+        f"position errors expected beyond the gate of {gate_m:g} m, by the claimed covariances: {said}; RMSE and NEES "
+        "are without them, so true covariances have a NEES of nees_expected, not 2 (a larger `measure: {match: "
+        "{gate_m: …}}` keeps them)"
     ]
 
 

@@ -312,6 +312,7 @@ PARTS = {
     "braking": "Braking in time",
     "conflict": "When the collision was foreseen",
     "accuracy": "How far off",
+    "lists": "What the lists hold",
     "own": "Own metrics",
 }
 """Tables that metrics are shown in, and their captions."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 import pytest
-from copem_replay.results.folder import load_results
+from copem_replay.results.read import load_results
 
 from copem_replay.core import components
 from copem_replay.core.errors import InputError

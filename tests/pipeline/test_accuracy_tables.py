@@ -266,10 +266,10 @@ class TestInTheHead:
         plan = experiment(units={"ego": UNITS["ego"]}, pems=pems(sigma_m=sigma_m), measure=APPEARS,
                           configurations=configurations("union"))  # fmt: skip
         result = run(plan, [still()])
-        found = [note for note in result.notes if "is beyond the gate of 3 m" in note]
+        found = [note for note in result.notes if "expected beyond the gate of 3 m" in note]
         assert len(found) == said
         if said:
-            assert "ideal 0.32, union 0.32;" in found[0], "e^(−9/8), of the truth none"
+            assert "ideal 32 %, union 32 %;" in found[0], "e^(−9/8), of the truth none"
             assert figures(result, "union")["nees_expected"] == pytest.approx(0.9184, abs=1e-4)
 
     def test_two_units_list_it_twice(self) -> None:

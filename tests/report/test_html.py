@@ -99,7 +99,7 @@ class TestNumbers:
     def test_the_summary_has_the_numbers_of_the_file(self, read: Page, made: Path) -> None:
         rows = summary_rows(made)
         checked = 0
-        for id_ in ("summary", "braking", "accuracy"):
+        for id_ in ("summary", "braking", "accuracy", "lists"):
             assert list(read.tables[id_]) == list(NAMES)
             for name, cells in read.tables[id_].items():
                 for column, cell in cells.items():
@@ -143,7 +143,9 @@ class TestNumbers:
                     assert found is None or float(found) == pytest.approx(wanted, rel=1e-8, abs=1e-12)
 
     def test_every_column_shown_is_explained(self, read: Page) -> None:
-        shown = {name for id_ in ("summary", "braking", "accuracy", "regret") for name in read.rows[id_][0][1:]}
+        shown = {
+            name for id_ in ("summary", "braking", "accuracy", "lists", "regret") for name in read.rows[id_][0][1:]
+        }
         terms = re.findall(r"<dt><code>(.*?)</code></dt><dd>(.+?)</dd>", read.html)
         assert shown == {name for name, _ in terms}
 
