@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 import pytest
-from copem_replay.results.read import load_results
 
 from copem_replay.core import components
 from copem_replay.core.errors import InputError
@@ -20,6 +19,7 @@ from copem_replay.perception.visibility import NO_STATICS
 from copem_replay.report.figures import runs_figure
 from copem_replay.report.html.page import page
 from copem_replay.report.html.study import load_study
+from copem_replay.results.read import load_results
 from tests.experiment.test_validate import against_logs, drive, without_logs
 from tests.helpers import experiments, scenes
 from tests.helpers.report_pages import Page, changed, replayed
