@@ -15,6 +15,7 @@ import importlib as _importlib
 from typing import TYPE_CHECKING
 
 from copem_replay.core.compiled import cache_note as _cache_note
+from copem_replay.core.moved import put_up_signposts as _put_up_signposts
 
 if TYPE_CHECKING:
     from copem_replay.cli.api import plot
@@ -145,6 +146,7 @@ _MODULE = {
 }
 
 _cache_note()  # before Numba is imported
+_put_up_signposts()
 
 
 if not TYPE_CHECKING:  # type checkers would take every name to be there
