@@ -103,12 +103,12 @@ def _fusing(world: World, name: str, seen: Tracks, told: Lists) -> tuple[Callabl
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
     heard = listen(seen, world.truth, world.experiment, name)
     configuration = world.experiment.configurations[name]
-    age_s, fusion = configuration.max_age_s, configuration.fusion
-    count = len(instants(heard, max_age_s=age_s).issue_s)
+    age_of_information_s, fusion = configuration.max_age_s, configuration.fusion
+    count = len(instants(heard, max_age_s=age_of_information_s).issue_s)
     if isinstance(fusion, ListFusion):
-        ready = reports(heard, told, max_age_s=age_s)
+        ready = reports(heard, told, max_age_s=age_of_information_s)
         return lambda: fusion.fuse(ready), count
-    return lambda: fuse(heard, max_age_s=age_s, without_object_ix=world.scene.ego_ix), count
+    return lambda: fuse(heard, max_age_s=age_of_information_s, without_object_ix=world.scene.ego_ix), count
 
 
 # -------------------------------------------------------------------------------------------------- nearest neighbours

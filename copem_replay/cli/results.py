@@ -21,7 +21,7 @@ def compare(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write everything as .csv, or the table as .md.")
     ] = None,
-    ghosts_per_min: Annotated[
+    false_positives_per_min: Annotated[
         float | None,
         typer.Option(metavar="X", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
     ] = None,
@@ -46,7 +46,9 @@ def compare(
     elif run is not None or log is not None:
         raise InputError(f"--{'log' if run is None else 'run'}: expected --rrd FILE with it, found none")
     names = listed(configurations)
-    comparison = compared(folders, configurations=names, baseline=baseline, ghosts_per_min=ghosts_per_min)
+    comparison = compared(
+        folders, configurations=names, baseline=baseline, false_positives_per_min=false_positives_per_min
+    )
     notes = list(comparison.notes)
     if rrd is not None:
         notes += write_beside(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)

@@ -129,8 +129,8 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             if _is_name(name) and str(name) not in configurations:
                 yield source.at((*where, k), unknown("configuration", name, configurations))
     carried = [name for name, unit in _items(data.get("units")) if isinstance(unit.get("on"), dict)]
-    if sweep.get("share") and not carried:
-        yield source.at(("sweep", "share"), "no unit is `on: {classes, share}`")
+    if sweep.get("penetration_rate") and not carried:
+        yield source.at(("sweep", "penetration_rate"), "no unit is `on: {classes, penetration_rate}`")
     if sweep.get("rate_hz") and not units:
         yield source.at(("sweep", "rate_hz"), "the experiment has no units")
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")

@@ -188,6 +188,8 @@ def _message(items: Sequence[Any], key: Key, data: Any) -> str:
         known = _names_at(key[:-1], data)
         near = difflib.get_close_matches(str(key[-1]), known, n=1)
         hint = f"did you mean {near[0]}?{_unit(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
+        if _RENAMED.get(str(key[-1])) in known:
+            return f"`{key[-1]}` is called `{_RENAMED[str(key[-1])]}` now"
         if key[-1] in _DEVIATIONS and "covariance_m2" in known:
             hint = f"{_variances(first['input'])} says it"
         return "unknown key" + (f"; {hint}" if known else "")
@@ -201,6 +203,8 @@ def _message(items: Sequence[Any], key: Key, data: Any) -> str:
     return f"expected {', or '.join(words)}, found {_short(first['input'])}{_percent(first)}"
 
 
+_RENAMED = {"share": "penetration_rate"}
+"""Keys of version 0.1, and what they are called now."""
 _DEVIATIONS = ("sigma_m", "sigma", "std_m", "std", "stddev_m", "stddev")
 
 

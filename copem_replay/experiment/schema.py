@@ -70,7 +70,9 @@ class Unit(Placement):
                 raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
             return self
         if (self.on is None) == (self.at is None):
-            raise ValueError("expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`")
+            raise ValueError(
+                "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}` and `at: [x, y]`"
+            )
         if self.height_m is None and self.at is not None:
             raise ValueError("height_m: needed for a unit `at` a place; only a carried one is on a roof by default")
         if self.ground_z_m is not None and self.at is None:
@@ -135,7 +137,7 @@ class SweptBy(Frozen):
     latency_s: SweptNames | None = None
     rate_hz: SweptNames | None = None
     units: SweptNames | None = None
-    share: SweptNames | None = None
+    penetration_rate: SweptNames | None = None
 
 
 def _swept_by(value: object) -> str:
@@ -150,19 +152,22 @@ class Sweep(Frozen):
 
     By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
     `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
-    `units`: how many of a configuration's units beside the ego's, the first ones. `share`: of those who carry a unit.
+    `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
+    how many of those that may carry a unit do.
     """
 
     configurations: Swept | None = None
     latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
-    share: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        if not (self.latency_s or self.rate_hz or self.units or self.share):
-            raise ValueError("expected values of latency_s, rate_hz, units or share, such as `latency_s: [0, 0.5, 1]`")
+        if not (self.latency_s or self.rate_hz or self.units or self.penetration_rate):
+            raise ValueError(
+                "expected values of latency_s, rate_hz, units or penetration_rate, such as `latency_s: [0, 0.5, 1]`"
+            )
         for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
             if self.chosen(quantity) and not getattr(self, quantity):
                 raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")

@@ -190,11 +190,14 @@ def _seen(said: Said, rules: Rules, f: int, now_s: float) -> Float:
     """Places and their covariances (n, 5): x, y, ee, en, nn of the entries of list f as of `now_s`."""
     rows = said.rows[said.start[f] : said.start[f + 1]]
     seen = np.empty((len(rows), 5))
-    age_s = max(now_s - said.captured_s[f], 0.0) if rules.late == PREDICT else 0.0
-    grown = rules.q_m2ps3 * age_s**3 / 3
+    age_of_information_s = max(now_s - said.captured_s[f], 0.0) if rules.late == PREDICT else 0.0
+    grown = rules.q_m2ps3 * age_of_information_s**3 / 3
     for i in range(len(rows)):
         entry = said.entries[rows[i]]
-        seen[i, 0], seen[i, 1] = entry.x_m + age_s * entry.vx_mps, entry.y_m + age_s * entry.vy_mps
+        seen[i, 0], seen[i, 1] = (
+            entry.x_m + age_of_information_s * entry.vx_mps,
+            entry.y_m + age_of_information_s * entry.vy_mps,
+        )
         ee, en, nn = floored(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
         seen[i, 2], seen[i, 3], seen[i, 4] = ee + grown, en, nn + grown
     return seen

@@ -29,10 +29,12 @@ Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
 
 
 class Carriers(Frozen):
-    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability `share`."""
+    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability
+    `penetration_rate`.
+    """
 
     classes: ClassNames
-    share: Share
+    penetration_rate: Share
 
 
 def _what_carries(value: object) -> str:

@@ -50,10 +50,10 @@ def _row_columns(accuracy: Accuracy) -> dict[str, Any]:
         "bias_north_m": mean("north_m", "placed"),
         "velocity_rmse_mps": np.sqrt(mean("velocity_square_m2ps2", "placed")),
         "nees": mean("nees"),
-        "age_s": mean("age_s"),
+        "age_of_information_s": mean("age_of_information_s"),
         "identity_switches": np.where(sums["tracked"] > 0, sums["switches"], np.nan),
         "duplicates": sums["duplicates"],
-        "mtl_s": sums["mtl_s"],
+        "longest_gap_s": sums["longest_gap_s"],
     }
 
 

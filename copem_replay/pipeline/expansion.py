@@ -1,6 +1,6 @@
 """Fleets: units that some objects carry and others don't, each by an addressed draw of its own in every run.
 
-`on: {classes, share}` stands for one unit per object of those classes (but the ego). In a run an object carries its
+`on: {classes, penetration_rate}` stands for one unit per object of those classes (but the ego). In a run an object carries its
 unit when its number is below the share, so that who carries one at 30 % does at 50 %, too.
 """
 
@@ -145,7 +145,7 @@ def expand(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
                     f"units: {name}:{one} is what {name} is called on object {one}; choose another name"
                 )
             units[f"{name}:{one}"] = unit.model_copy(update={"on": one})
-            named, carriers, share = [*named, name], [*carriers, one], [*share, unit.on.share]
+            named, carriers, share = [*named, name], [*carriers, one], [*share, unit.on.penetration_rate]
     return _expanded(experiment, units, tuple(named), tuple(carriers), np.array(share))
 
 

@@ -1,6 +1,6 @@
 """Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
 
-A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `share` the units themselves.
+A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units themselves.
 Configurations that it leaves as they are, or makes equal to one before, are left out. A latency is varied only where
 there is one (above 0, or by unit) or where the configuration is named: who hears of nobody over the air has none.
 """
@@ -15,7 +15,7 @@ from copem_replay.experiment.schema import Configuration, Experiment, SweptBy, U
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers
 
-KINDS = ("latency_s", "rate_hz", "units", "share")
+KINDS = ("latency_s", "rate_hz", "units", "penetration_rate")
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
         return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
     if kind == "rate_hz":
         return any(unit.recorded is None for unit in units)
-    return kind != "share" or any(isinstance(unit.on, Carriers) for unit in units)
+    return kind != "penetration_rate" or any(isinstance(unit.on, Carriers) for unit in units)
 
 
 def _is_ego(unit: Unit) -> bool:
@@ -152,9 +152,9 @@ def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, U
         return {
             name: unit if unit.recorded else unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()
         }
-    if kind == "share":
+    if kind == "penetration_rate":
         return {
-            name: unit.model_copy(update={"on": unit.on.model_copy(update={"share": value})})
+            name: unit.model_copy(update={"on": unit.on.model_copy(update={"penetration_rate": value})})
             if isinstance(unit.on, Carriers)
             else unit
             for name, unit in units.items()

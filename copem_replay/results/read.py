@@ -25,6 +25,7 @@ from copem_replay.results.tables import (
     CONFLICT,
     DETECTIONS,
     EXACT,
+    FORMAT,
     OPTIONAL,
     ROWS,
     VERDICTS,
@@ -269,10 +270,18 @@ def _check(folder: Path, table: pd.DataFrame, experiment: Experiment) -> None:
         )
 
 
+def check_format(folder: Path) -> None:
+    """Raises InputError, one line, where results are of another format than this version reads; none says nothing."""
+    if (folder / MARK).is_file():
+        _provenance(folder / MARK)
+
+
 def _provenance(path: Path) -> Provenance:
     """Read `provenance.json`. Raises InputError."""
     try:
         data: Any = json.loads(path.read_text(encoding="utf-8"))
+        if (found := dict(data).get("format", 1)) != FORMAT:
+            raise InputError(f"{path.parent}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
         logs = tuple(LogFile(str(log["log"]), log.get("topic"), str(log["sha256"])) for log in data["logs"])
         measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
         used_s, run_shown = measure.pop("horizon_used_s", None), data.get("run_shown") or {}

@@ -14,6 +14,9 @@ from copem_replay.core.errors import InputError
 if TYPE_CHECKING:
     import pyarrow as pa
 
+FORMAT = 2
+"""Of results folders: raised when columns, files or their meaning change so that readers have to know."""
+
 AGAIN = "run the experiment again with --overwrite"
 """What helps against a table that is damaged or of an older version."""
 

@@ -30,6 +30,7 @@ from copem_replay.pipeline.sweep import resolved
 from copem_replay.results.belongings import MARK
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
+from copem_replay.results.tables import FORMAT
 
 _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
@@ -161,6 +162,7 @@ def provenance_of(
     """What made these results: versions, logs, seed, metric parameters; no clock, no host."""
     shown = {log: shown_runs(experiment, result, log) for log in shown_logs(experiment, result)}
     return {
+        "format": FORMAT,
         "copem_replay": version("copem-replay"),
         "python": platform.python_version(),
         "libraries": {name: version(name) for name in _LIBRARIES},

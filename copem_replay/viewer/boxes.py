@@ -125,8 +125,8 @@ def believed(out: Out, path: list[str], scene: Scene, belief: Belief, colour: Rg
     shades = np.array([_rgba((*colour, alpha)) for alpha in ALPHAS], dtype=np.uint32)
 
     def more(rows: Int) -> dict[str, Any]:
-        age_s = tracks.arrives_s[0, tracks.frame_ix[rows]] - captured_s[rows]
-        step = np.clip(np.rint(age_s / STEP_S), 0, len(ALPHAS) - 1).astype(np.int64)
+        age_of_information_s = tracks.arrives_s[0, tracks.frame_ix[rows]] - captured_s[rows]
+        step = np.clip(np.rint(age_of_information_s / STEP_S), 0, len(ALPHAS) - 1).astype(np.int64)
         return {"class_ids": kind[rows], "colors": shades[step]}
 
     _boxes(out, [*path, "boxes"], tracks, more)

@@ -78,7 +78,7 @@ class Status:
     status: Int  # index into STATUSES
     unit_ix: Int  # of the experiment: who sees most of it, or whose list is under way
     until_s: Float  # until a list under way arrives
-    age_s: Float  # of what is listed
+    age_of_information_s: Float  # of what is listed
     x_m: Float  # where it truly is, or where it is believed to be while absent
     y_m: Float
     top_m: Float
@@ -193,7 +193,7 @@ def _held(belief: Belief, object_ix: int, m: int, clock: Clock, count_earlier: b
     held = np.flatnonzero(row >= 0)
     row = row[held]
     captured_s = belief.captured_s[0, row]
-    made.age_s[held, m] = made.elapsed_ns[held] * 1e-9 - captured_s
+    made.age_of_information_s[held, m] = made.elapsed_ns[held] * 1e-9 - captured_s
     gone = np.isnan(made.x_m[held, m])  # whatever is under way
     top_m = fused.z_m[0] + fused.height_m[0] / 2
     for column, value in ((made.x_m, fused.x_m[0]), (made.y_m, fused.y_m[0]), (made.top_m, top_m)):

@@ -87,7 +87,9 @@ def _told(
     by = unit[hidden], frame[hidden], column[hidden]
     share, body = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
     share[hidden], body[hidden] = seen.share[by], seen.body_ix[by]
-    time_s = np.nan_to_num(np.where(status >= EARLY, made.age_s[rows, column], made.until_s[rows, column]))
+    time_s = np.nan_to_num(
+        np.where(status >= EARLY, made.age_of_information_s[rows, column], made.until_s[rows, column])
+    )
     near = seen.in_range[:, frame, column].any(axis=0)
     whole = [np.rint(value).astype(np.int64) for value in (time_s * 10, share * 100)]
     columns = np.stack([column, status, unit, *whole, body, near, started], axis=-1)

@@ -342,7 +342,7 @@ SEED = "4: seed: expected a whole number of 64 bits (-2^63 … 2^64 - 1), found 
 A_TURN = "expected degrees from -360 to 360"
 EITHER = "expected one of `pem: <name>` and `recorded: {topic: …}`"
 RECORDED = "recorded: goes with one place, `on` an object or `at` a point, and without rate_hz"
-PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and `at: [x, y]`"
+PLACE = "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}` and `at: [x, y]`"
 CASES = [
     (TOP, "version: 2", "1: version: expected 1, found 2"),
     (TOP, "version: '1'", "1: version: expected 1, found '1'"),
@@ -425,7 +425,7 @@ CASES = [
     (UNIT, "on: ego, pem: onboard, recorded: {topic: lists}", f": {EITHER}"),
     (UNIT, "recorded: {topic: lists}, rate_hz: 5", f": {RECORDED}"),
     (UNIT, "recorded: {topic: lists}, on: ego, at: [1, 2]", f": {RECORDED}"),
-    (UNIT, "recorded: {topic: lists}, on: {classes: [car], share: 0.5}", f": {RECORDED}"),
+    (UNIT, "recorded: {topic: lists}, on: {classes: [car], penetration_rate: 0.5}", f": {RECORDED}"),
     (UNIT, "recorded: lists", ".recorded: expected keys and values, found 'lists'"),
     (UNIT, "recorded: {}", ".recorded.topic: missing"),
     (UNIT, "recorded: {topic: ''}", ".recorded.topic: expected at least 1 character, found ''"),
@@ -447,14 +447,14 @@ CASES = [
     (UNIT, "on: ego, height: 1, pem: onboard", ".height: unknown key; did you mean height_m?"),
     (UNIT, "at: [0, 0], pem: onboard",
      ": height_m: needed for a unit `at` a place; only a carried one is on a roof by default"),
-    (UNIT, "on: {classes: [cra], share: 2}, pem: onboard",
+    (UNIT, "on: {classes: [cra], penetration_rate: 2}, pem: onboard",
      ".on.classes[0]: expected one of pedestrian, bicycle, motorcycle, car, van, truck, bus, trailer, animal, other, "
      "vehicle, vru, vehicles; found 'cra'",
-     ".on.share: expected at most 1, found 2"),
-    (UNIT, "on: {classes: [car]}, pem: onboard", ".on.share: missing"),
-    (UNIT, "on: {classes: [car], share: 30}, pem: onboard",
-     ".on.share: expected at most 1, found 30; a fraction: 30 % is 0.3"),
-    (UNIT, "on: {classes: [car], share: 300}, pem: onboard", ".on.share: expected at most 1, found 300"),
+     ".on.penetration_rate: expected at most 1, found 2"),
+    (UNIT, "on: {classes: [car]}, pem: onboard", ".on.penetration_rate: missing"),
+    (UNIT, "on: {classes: [car], penetration_rate: 30}, pem: onboard",
+     ".on.penetration_rate: expected at most 1, found 30; a fraction: 30 % is 0.3"),
+    (UNIT, "on: {classes: [car], penetration_rate: 300}, pem: onboard", ".on.penetration_rate: expected at most 1, found 300"),
     (UNIT, "on: [1], pem: onboard", ".on: expected text, found [1]"),
     (UNIT, "on: ego, height_m: -1, pem: onboard", ".height_m: expected at least 0, found -1"),
     (UNIT, "on: ego, height_m: '1', pem: onboard", ".height_m: expected a number, found '1'"),
@@ -488,14 +488,14 @@ CASES = [
     (MEASURE, "conflict: {horizon_s: 0}", ".conflict.horizon_s: expected more than 0, found 0"),
     (MEASURE, "exact: yes", ".exact: expected true or false, found 'yes'"),
     (SWEEP, "{}",
-     ": expected values of latency_s, rate_hz, units or share, such as `latency_s: [0, 0.5, 1]`"),
+     ": expected values of latency_s, rate_hz, units or penetration_rate, such as `latency_s: [0, 0.5, 1]`"),
     (SWEEP, "{latency_s: 1}", ".latency_s: expected a list, found 1"),
     (SWEEP, "{units: [1.5, -1]}",
      ".units[0]: expected a whole number, found 1.5",
      ".units[1]: expected at least 0, found -1"),
     (SWEEP, "{units: [ego, 2]}", f".units[0]: {HOW_MANY}, found 'ego'"),
     (SWEEP, "{units: [1, [ego, mast]]}", f".units[1]: {HOW_MANY}, found ['ego', 'mast']"),
-    (SWEEP, "{share: [0, 50]}", ".share[1]: expected at most 1, found 50; a fraction: 50 % is 0.5"),
+    (SWEEP, "{penetration_rate: [0, 50]}", ".penetration_rate[1]: expected at most 1, found 50; a fraction: 50 % is 0.5"),
     (SWEEP, "{latency: [1]}", ".latency: unknown key; did you mean latency_s?"),
     (PEM, "", ": expected keys and values, found nothing"),
     (PEM, "{}", ".units: missing"),

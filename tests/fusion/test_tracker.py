@@ -472,7 +472,9 @@ def test_existence_fades_from_capture_and_stale_from_arrival():
     for late, ages_s in (("stale", (0.0, 0.5)), ("predict", (1.5, 2.0)), ("replay", (1.5, 2.0))):
         found = fuse_one(reports, late=late, publish=0.05, **AT_ONCE)
         claimed = [one["existence"][0] for one in found]
-        assert claimed == pytest.approx([0.9 * math.exp(-age_s) for age_s in ages_s], abs=1e-12), late
+        assert claimed == pytest.approx(
+            [0.9 * math.exp(-age_of_information_s) for age_of_information_s in ages_s], abs=1e-12
+        ), late
 
 
 @pytest.mark.parametrize("late", LATE)
@@ -490,8 +492,8 @@ def test_an_older_list_does_not_override_what_its_unit_said_later(late: str):
 def test_another_units_older_list_counts(late: str):
     lists = [[entry(0.0, existence=0.9), entry(1.0, existence=0.3)]]
     (one,) = fuse_one(reports_of(lists, ["a", "b"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
-    age_s = 0.0 if late == "stale" else 0.2
-    expected = 1 - (1 - 0.9 * math.exp(-0.1)) * (1 - 0.3 * math.exp(-age_s))
+    age_of_information_s = 0.0 if late == "stale" else 0.2
+    expected = 1 - (1 - 0.9 * math.exp(-0.1)) * (1 - 0.3 * math.exp(-age_of_information_s))
     assert one["existence"] == pytest.approx(expected, abs=1e-12)
     assert one["x_m"] > 0.1
 

@@ -240,8 +240,8 @@ class TestWhoItIs:
         result = replayed(path, unit={"delay_s": 0.5})
         for name in ("ideal", "union"):
             assert row(result, name)["detection_s"] == pytest.approx(0.9)
-        assert figure(result, "ghosts_per_min") == pytest.approx(600), "one in each of 10 lists per s"
-        assert figure(result, "stale_ghosts_per_min") == pytest.approx(600)
+        assert figure(result, "false_positives_per_min") == pytest.approx(600), "one in each of 10 lists per s"
+        assert figure(result, "stale_false_positives_per_min") == pytest.approx(600)
         assert figure(result, "position_rmse_m") == pytest.approx(10.0)
 
     def test_the_receivers_own_body_is_left_out(self, tmp_path: Path) -> None:
@@ -300,7 +300,7 @@ class TestInARun:
         path = drive(tmp_path / "a.mcap", *lists)
         for classes, per_list in ((["car"], 1), (["vru"], 2), (["car", "vru"], 3), (None, 1)):
             result = replayed(path, measure={"objects": {"classes": classes}})
-            assert figure(result, "ghosts_per_min") == pytest.approx(600 * per_list)
+            assert figure(result, "false_positives_per_min") == pytest.approx(600 * per_list)
 
     def test_without_an_ego_distances_are_from_the_units_place(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", list_of(0.5, car(30)), list_of(0.6, car(31)))

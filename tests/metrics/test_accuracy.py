@@ -102,7 +102,7 @@ def test_latency_is_an_error_now_and_none_at_capture() -> None:
     assert figure("position_rmse_m", of) == pytest.approx(1.0)
     assert figure("bias_east_m", of) == pytest.approx(-1.0)
     assert figure("position_rmse_captured_m", of) == pytest.approx(0.0)
-    assert figure("age_s", of) == pytest.approx(0.5)
+    assert figure("age_of_information_s", of) == pytest.approx(0.5)
     assert figure("velocity_rmse_mps", of) == pytest.approx(0.0)
 
 
@@ -141,20 +141,24 @@ def test_latency_counts_in_full_whatever_the_gate(latency_s: float) -> None:
     assert figure("position_rmse_m", of) == pytest.approx(math.hypot(12 * latency_s, 0.5))
     assert figure("bias_east_m", of) == pytest.approx(-12 * latency_s)
     assert figure("velocity_rmse_mps", of) == pytest.approx(0.0)
-    assert figure("age_s", of) == pytest.approx(latency_s)
+    assert figure("age_of_information_s", of) == pytest.approx(latency_s)
     assert figure("identity_switches", of) == 1.0
     # At the instants the entries tell of.
     assert figure("position_rmse_captured_m", of) == pytest.approx(0.5)
     assert figure("nees", of) == pytest.approx(0.25)
-    assert figure("existence_error", of) == pytest.approx(0.2)
+    assert figure("existence_ece", of) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(("latency_s", "stale_per_min"), [(0.1, 0.0), (0.5, 60.0)])
 def test_what_a_stale_list_is_worth_now(latency_s: float, stale_per_min: float) -> None:
     of, none = late_by(latency_s), stale_per_min == 0
-    assert figure("ghosts_per_min", of) == figure("stale_ghosts_per_min", of) == pytest.approx(stale_per_min)
+    assert (
+        figure("false_positives_per_min", of)
+        == figure("stale_false_positives_per_min", of)
+        == pytest.approx(stale_per_min)
+    )
     assert of.by_object[0, 0]["missed"] == (0 if none else 5)
-    assert figure("mtl_s", of) == pytest.approx(1.0 if none else 5.0)
+    assert figure("longest_gap_s", of) == pytest.approx(1.0 if none else 5.0)
     assert figure("gospa_missed_m", of) == pytest.approx(0.0 if none else math.sqrt(4.5))
 
 
@@ -184,7 +188,7 @@ def test_a_pair_whose_object_has_a_gap_now_has_no_error_now() -> None:
     assert figure("bias_east_m", of) == pytest.approx(-0.5)
     assert figure("velocity_rmse_mps", of) == 0.0
     assert figure("nees", of) == pytest.approx(0.25)
-    assert figure("age_s", of) == pytest.approx(1.0)
+    assert figure("age_of_information_s", of) == pytest.approx(1.0)
     assert (of.by_distance[0, 0]["pairs"], of.by_time[0, 0]["pairs"], of.by_time[0, 0]["placed"]) == (2, 1, 0)
     # Nor can a list hold or miss what is not there.
     assert sums["missed"] == 0
@@ -306,7 +310,7 @@ def test_duplicates_of_measured_objects() -> None:
     assert of.by_object[0, 0]["duplicates"] == 2  # in the lists looked at
     assert of.by_run[0]["duplicates"] == 4  # in all
     assert figure("duplicates_per_min", of) == pytest.approx(60.0)
-    assert figure("ghosts_per_min", of) == 0.0
+    assert figure("false_positives_per_min", of) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -329,24 +333,24 @@ def test_longest_time_unknown(held: str, look: tuple[float, float], longest_s: f
     lists = [entry(10) if h == "1" else NOTHING for h in held]
     ego = [None if h == "." else (0.0, 0.0) for h in held]
     of = assessed(lists, places={CAR: standing(10, 0, 5)}, looks={CAR: look}, ego=ego)
-    assert of.by_object[0, 0]["mtl_s"] == pytest.approx(longest_s)
-    assert figure("mtl_s", of) == pytest.approx(longest_s)
+    assert of.by_object[0, 0]["longest_gap_s"] == pytest.approx(longest_s)
+    assert figure("longest_gap_s", of) == pytest.approx(longest_s)
 
 
 def test_before_the_first_list_it_is_unknown() -> None:
     of = assessed([entry(10)] * 2, times_s=[2.0, 3.0], places={CAR: standing(10, 0, 2)}, looks={CAR: (0.5, 3)})
-    assert of.by_object[0, 0]["mtl_s"] == pytest.approx(1.5)
+    assert of.by_object[0, 0]["longest_gap_s"] == pytest.approx(1.5)
     # Nor is a list from before its stay one of them.
     of = assessed([entry(10), NOTHING], places={CAR: standing(10, 0, 2)}, looks={CAR: (1, 1.5)}, since_s=1.0)
-    assert of.by_object[0, 0]["mtl_s"] == pytest.approx(0.5)
+    assert of.by_object[0, 0]["longest_gap_s"] == pytest.approx(0.5)
 
 
 def test_never_matched() -> None:
     of = assessed([NOTHING] * 3, places={CAR: standing(10, 0, 3)}, looks={CAR: (0, 2)})
-    for name in ("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps", "age_s", "nees",
-                 "nees_low", "nees_high", "identity_switches", "existence_error"):  # fmt: skip
+    for name in ("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps", "age_of_information_s", "nees",
+                 "nees_low", "nees_high", "identity_switches", "existence_ece"):  # fmt: skip
         assert figure(name, of) is None, name
-    assert figure("mtl_s", of) == pytest.approx(2.0)
+    assert figure("longest_gap_s", of) == pytest.approx(2.0)
     assert figure("gospa_m", of) == figure("gospa_missed_m", of) == pytest.approx(math.sqrt(9 / 2))
     assert figure("ospa_m", of) == pytest.approx(3.0)
     assert of.by_object[0, 0]["missed"] == of.by_object[0, 0]["looked"] == 3
@@ -365,7 +369,7 @@ def test_ghosts_are_of_measured_classes_and_of_no_object_at_all() -> None:
     assert of.by_run[0]["ghosts"] == 4
     assert of.ghosts_at.tolist() == [[4, 4, 2, 2]]
     assert of.by_object["ghosts"].tolist() == [[3, 1]]  # at 0 s the other car is not yet looked at
-    assert figure("ghosts_per_min", of) == pytest.approx(80.0)  # 4 in 3 lists at 1 Hz
+    assert figure("false_positives_per_min", of) == pytest.approx(80.0)  # 4 in 3 lists at 1 Hz
 
 
 def test_a_ghost_halfway_goes_to_the_first() -> None:
@@ -438,12 +442,12 @@ def test_expected_calibration_error() -> None:
     # Of four entries at 0.85 three are of the car, of two at 0.25 none; ten bins of equal width.
     high, low = [entry(10, existence=0.85)] * 3 + [entry(50, existence=0.85)], [entry(60, existence=0.25)] * 2
     of = assessed([*high, *low], places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})
-    assert figure("existence_error", of) == pytest.approx((4 * 0.10 + 2 * 0.25) / 6)
+    assert figure("existence_ece", of) == pytest.approx((4 * 0.10 + 2 * 0.25) / 6)
     assert of.by_existence["entries"].tolist() == [[0, 0, 2, 0, 0, 0, 0, 0, 4, 0]]
     assert of.by_existence["with_object"][0, 8] == 3
     ends = assessed([entry(10, existence=1.0), entry(10, existence=0.0)], places={CAR: standing(10, 0, 2)}, looks={})
     assert ends.by_existence["entries"].tolist() == [[1, 0, 0, 0, 0, 0, 0, 0, 0, 1]]
-    assert figure("existence_error", ends) == pytest.approx(0.5)
+    assert figure("existence_ece", ends) == pytest.approx(0.5)
 
 
 def test_claims_that_are_too_high_do_not_make_up_for_those_that_are_too_low() -> None:
@@ -452,7 +456,7 @@ def test_claims_that_are_too_high_do_not_make_up_for_those_that_are_too_low() ->
         [entry(10, existence=0.25)] * 2 + [entry(50, existence=0.75)] * 2,
         places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)},
     )  # fmt: skip
-    assert figure("existence_error", of) == pytest.approx(0.75)
+    assert figure("existence_ece", of) == pytest.approx(0.75)
 
 
 def test_bands_of_distance_and_time() -> None:
@@ -477,18 +481,18 @@ def test_no_looks_no_lists() -> None:
     assert of.by_object.shape == (2, 0)
     assert of.error_m.shape == (2, 0)
     assert of.by_run["ghosts"].tolist() == [1, 0]
-    assert figure("ghosts_per_min", of) == pytest.approx(15.0)  # 1 in 2 runs of 2 lists at 1 Hz
-    assert all(figure(name, of) is None for name in ("gospa_m", "gospa_false_m", "ospa_m", "mtl_s"))
+    assert figure("false_positives_per_min", of) == pytest.approx(15.0)  # 1 in 2 runs of 2 lists at 1 Hz
+    assert all(figure(name, of) is None for name in ("gospa_m", "gospa_false_m", "ospa_m", "longest_gap_s"))
     of = assessed([], [], places={CAR: []}, looks={CAR: (1, 3)})
     assert of.error_m.shape == of.gospa.shape == (2, 0)
-    assert of.by_object["mtl_s"].tolist() == [[2.0], [2.0]]
-    assert all(figure(name, of) is None for name in FIGURES if name != "mtl_s")
+    assert of.by_object["longest_gap_s"].tolist() == [[2.0], [2.0]]
+    assert all(figure(name, of) is None for name in FIGURES if name != "longest_gap_s")
 
 
 def test_time_of_irregular_lists_and_of_one() -> None:
     of = assessed([entry(50)] * 4, times_s=[0, 1, 3, 4], ego=[(0, 0), (0, 0), None, (0, 0)], places={}, looks={})
     assert of.by_run[0]["time_s"] == pytest.approx(3.0)  # three lists, the only neighbours 1 s apart
-    assert figure("ghosts_per_min", assessed([entry(50)], places={}, looks={})) is None
+    assert figure("false_positives_per_min", assessed([entry(50)], places={}, looks={})) is None
 
 
 def test_totals_of_logs_add() -> None:
@@ -665,7 +669,7 @@ def test_what_is_known_and_as_which_track_goes_on_over_a_cut() -> None:
     made.tells_of_now = True
     made.found = made.matched(made.lists)
     sums = made.in_stretches([0.5]).by_object[0, 0]
-    assert (sums["switches"], sums["mtl_s"]) == (1, 2.0)
+    assert (sums["switches"], sums["longest_gap_s"]) == (1, 2.0)
 
 
 def test_lists_too_many_or_too_few_are_a_defect() -> None:

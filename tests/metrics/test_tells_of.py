@@ -259,7 +259,7 @@ def test_error_grows_with_latency_as_far_as_the_object_goes() -> None:
 
 
 def test_calibration_does_not_go_by_latency() -> None:
-    now, then = (late(latency_s, "gnn").summary["existence_error"].iloc[0] for latency_s in (0.0, 0.6))
+    now, then = (late(latency_s, "gnn").summary["existence_ece"].iloc[0] for latency_s in (0.0, 0.6))
     assert then == pytest.approx(now, abs=0.02)
 
 

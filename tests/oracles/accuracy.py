@@ -197,7 +197,7 @@ def plainly(
                 off = np.array([entry["x_m"], entry["y_m"]]) - then
                 assert np.hypot(*off) <= settings.gate_m + 1e-6
                 by_object[s, m]["square_then_m2"] += off @ off
-                by_object[s, m]["age_s"] += issue_s[k] - entry["captured_s"]
+                by_object[s, m]["age_of_information_s"] += issue_s[k] - entry["captured_s"]
                 beyond, mean, square = expected_of(entry, settings.gate_m)
                 by_object[s, m]["beyond_gate"] += beyond
                 by_object[s, m]["nees_square_expected"] += square
@@ -226,7 +226,7 @@ def plainly(
                 by_object[s, m]["velocity_square_m2ps2"] += speed @ speed
             by_object[s, m]["tracked"] = len(tracks)
             by_object[s, m]["switches"] = sum(a != b for a, b in pairwise(tracks))
-            by_object[s, m]["mtl_s"] = longest_unknown(known, looks.onset_s[m], looks.ended_s[m])
+            by_object[s, m]["longest_gap_s"] = longest_unknown(known, looks.onset_s[m], looks.ended_s[m])
         for k in present:
             here = [
                 (m, place)

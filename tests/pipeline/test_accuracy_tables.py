@@ -137,7 +137,7 @@ class TestTheSame:
             assert table["matched_lists"].tolist() == count.tolist()
             rmse_m = [np.sqrt(np.nanmean(one**2)) if n else np.nan for one, n in zip(errors, count, strict=True)]
             np.testing.assert_allclose(table["position_rmse_m"], rmse_m, atol=HALF)
-            assert table["mtl_s"].mean() == pytest.approx(figures(result, name)["mtl_s"])
+            assert table["longest_gap_s"].mean() == pytest.approx(figures(result, name)["longest_gap_s"])
             assert table["identity_switches"].isna().all() == (name != "tracker")
             bias_m = (table["bias_east_m"].fillna(0) * count).sum() / count.sum()
             assert bias_m == pytest.approx(figures(result, name)["bias_east_m"])
@@ -148,10 +148,12 @@ class TestTheSame:
             table, found = rows(result, name, "lists"), figures(result, name)
             not_stale = table["ghosts"] - table["stale_ghosts"]
             assert not_stale.tolist() == [counts[0] for counts in table["ghosts_at"]]
-            assert table["stale_ghosts"].sum() / table["minutes"].sum() == pytest.approx(found["stale_ghosts_per_min"])
+            assert table["stale_ghosts"].sum() / table["minutes"].sum() == pytest.approx(
+                found["stale_false_positives_per_min"]
+            )
             assert all((np.diff(counts) <= 0).all() for counts in table["ghosts_at"])
             assert all(tuple(existence) == EXISTENCE_THRESHOLDS for existence in table["existence"])
-            assert table["ghosts"].sum() / table["minutes"].sum() == pytest.approx(found["ghosts_per_min"])
+            assert table["ghosts"].sum() / table["minutes"].sum() == pytest.approx(found["false_positives_per_min"])
             assert table["duplicates"].sum() / table["minutes"].sum() == pytest.approx(found["duplicates_per_min"])
             assert list(zip(table["log"], table["run"], strict=True)) == [
                 (g, s) for g in ("one", "two") for s in range(5)
@@ -195,7 +197,7 @@ class TestTheSame:
             assert set(edges.ravel()) <= set(DISTANCE_EDGES_M)
             of = bands[bands["by"] == "existence"]
             off = (of["entries"] * (of["with_object_share"] - of["existence"]).abs()).sum() / of["entries"].sum()
-            assert off == pytest.approx(figures(result, name)["existence_error"])
+            assert off == pytest.approx(figures(result, name)["existence_ece"])
             ghosts = (of["entries"] * (1 - of["with_object_share"])).sum()
             # What is about nobody is a ghost now, or somebody has come to where it is.
             not_stale = (of_lists["ghosts"] - of_lists["stale_ghosts"]).sum()
@@ -214,7 +216,7 @@ class TestWhatIsThere:
 
     def test_fleets(self) -> None:
         """Each run has other units, so other instants: no accuracy.parquet; all else, whatever the blocks."""
-        fleet = {"ego": UNITS["ego"], "obu": {"on": {"classes": ["car"], "share": 0.5}, "pem": "p"}}
+        fleet = {"ego": UNITS["ego"], "obu": {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "p"}}
         late = configurations("union", "gnn", latency_s={"ego": 0.0, "default": 0.13})
         plan = experiment(units=fleet, pems=pems(0.8, 0.5), runs=8, measure=APPEARS, configurations=late)
         result = run(plan, [street("one", 10)])
@@ -227,7 +229,7 @@ class TestWhatIsThere:
             rmse_m = np.sqrt(square_m2 / table["matched_lists"].sum())
             assert rmse_m == pytest.approx(found["position_rmse_m"])
             lists = rows(result, name, "lists")
-            assert lists["ghosts"].sum() / lists["minutes"].sum() == pytest.approx(found["ghosts_per_min"])
+            assert lists["ghosts"].sum() / lists["minutes"].sum() == pytest.approx(found["false_positives_per_min"])
             assert lists["run"].tolist() == list(range(8))
             first = rows(result, name, "thresholds").groupby(KEYS, sort=False)["detection_s"].first()
             if name in ("union", "gnn"):
@@ -258,7 +260,13 @@ class TestInTheHead:
         result = run(plan, [still(*others)])
         late_s = 0.1 if kind == "tracker" else 0.0
         assert result.table["detection_s"].tolist() == [0.0] * 6 + [pytest.approx(late_s)] * 3
-        for figure in ("position_rmse_m", "position_rmse_captured_m", "ghosts_per_min", "duplicates_per_min", "age_s"):
+        for figure in (
+            "position_rmse_m",
+            "position_rmse_captured_m",
+            "false_positives_per_min",
+            "duplicates_per_min",
+            "age_of_information_s",
+        ):
             assert figures(result, kind)[figure] == pytest.approx(0, abs=1e-6), figure
 
     @pytest.mark.parametrize(("sigma_m", "said"), [(0.5, False), (2.0, True)])

@@ -134,7 +134,7 @@ def plans(draw: st.DrawFn) -> Experiment:
         "car": {"on": draw(st.sampled_from(["oncoming", "late", "blinking"])), "height_m": 1.5, "pem": "noisy"},
     }
     if draw(st.booleans()):
-        units["fleet"] = {"on": {"classes": ["car"], "share": 0.5}, "pem": "noisy"}
+        units["fleet"] = {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "noisy"}
     configurations: dict[str, Any] = {"GT": {"units": "truth", "latency_s": draw(late)}, "PEM": {"units": ["ego"]}}
     fusions: list[dict[str, Any]] = [
         {"kind": "ideal"}, {"kind": "ideal", "combine": "posterior"}, {"kind": "union"}, {"kind": "nms"},

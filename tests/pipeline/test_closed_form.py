@@ -580,7 +580,7 @@ class TestTails:
         ]
         units = {
             "mast": {"at": [20, 5], "height_m": 5.0, "pem": "p"},
-            "fleet": {"on": {"classes": ["car"], "share": 0.5}, "pem": "p"},
+            "fleet": {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "p"},
         }
         measure = {"onset": {"kind": "appears"}, "objects": {"classes": ["pedestrian"]}, "exact": True}
         row = run(masts(1, 0.9, units=units, measure=measure), [recording(things, until_s=1.0)]).summary.iloc[0]

@@ -63,7 +63,7 @@ def street(wanted: Sequence[Thing] | None = None, **changes: Any) -> Recording:
 
 def some(share: float, *classes: str, **changes: Any) -> dict[str, Any]:
     """A unit on a share of these classes."""
-    return {"on": {"classes": list(classes or ("car",)), "share": share}, "pem": "p"} | changes
+    return {"on": {"classes": list(classes or ("car",)), "penetration_rate": share}, "pem": "p"} | changes
 
 
 def plan(units: dict[str, Any], **changes: Any) -> Experiment:
@@ -709,7 +709,7 @@ pems:
   p: [{detection: {kind: constant, probability: 1.0}, error: {kind: gaussian, covariance_m2: [[1, 0], [0, 1]]}}]
 units:
   ego: {on: ego, pem: p}
-  fleet: {on: {classes: [car], share: 0.5}, pem: p}
+  fleet: {on: {classes: [car], penetration_rate: 0.5}, pem: p}
 configurations:
   GT: {units: truth}
   V2V: {units: all, latency_s: {ego: 0, default: 0.2}}
@@ -744,7 +744,7 @@ def test_the_run_that_is_shown_has_its_own_units(
     wanted, found = problems(source)
     assert wanted is not None, found
     assert found == []
-    assert wanted.units["fleet"].on == Carriers(classes=("car",), share=0.5)
+    assert wanted.units["fleet"].on == Carriers(classes=("car",), penetration_rate=0.5)
 
     scene = street([Thing("1", "car", standing(0, 0)), *(Thing(str(k), "car", standing(9, 9)) for k in range(2, 8))],
                    ego="1", log="square").scene  # fmt: skip
@@ -777,7 +777,7 @@ def test_the_run_that_is_shown_has_its_own_units(
 
 # ---------------------------------------------------------------------------------------------------- the checks
 
-FLEET = "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}"
+FLEET = "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}"
 
 
 @pytest.mark.parametrize(
@@ -801,10 +801,10 @@ FLEET = "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}"
         ),
         ([FLEET, "measure: {confirm: {hits: 1, of: 3}, exact: true}"], []),
         ([FLEET, "measure: {exact: true}"], []),
-        ([FLEET.replace("0.5", "1.5")], ["12: units.mast.on.share: expected at most 1, found 1.5"]),
-        ([FLEET.replace("0.5", "-0.1")], ["12: units.mast.on.share: expected at least 0, found -0.1"]),
-        ([FLEET.replace("0.5", "half")], ["12: units.mast.on.share: expected a number, found 'half'"]),
-        ([FLEET.replace(", share: 0.5", "")], ["12: units.mast.on.share: missing"]),
+        ([FLEET.replace("0.5", "1.5")], ["12: units.mast.on.penetration_rate: expected at most 1, found 1.5"]),
+        ([FLEET.replace("0.5", "-0.1")], ["12: units.mast.on.penetration_rate: expected at least 0, found -0.1"]),
+        ([FLEET.replace("0.5", "half")], ["12: units.mast.on.penetration_rate: expected a number, found 'half'"]),
+        ([FLEET.replace(", penetration_rate: 0.5", "")], ["12: units.mast.on.penetration_rate: missing"]),
         ([FLEET.replace("classes: [car], ", "")], ["12: units.mast.on.classes: missing"]),
         (
             [FLEET.replace("[car]", "[car, tram]")],
@@ -816,7 +816,7 @@ FLEET = "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}"
         (
             [FLEET.replace("pem", "at: [1, 2], pem")],
             [
-                "12: units.mast: expected one of `on: ego`, `on: <object id>`, `on: {classes, share}` and "
+                "12: units.mast: expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}` and "
                 "`at: [x, y]`"
             ],
         ),

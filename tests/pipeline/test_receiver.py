@@ -189,11 +189,11 @@ class TestInTheHead:
             assert detection_s == pytest.approx(expected_s) if expected_s else np.isnan(detection_s), name
             if name in ("ideal", *AT_ONCE):
                 found = figures(result, name)
-                assert found["ghosts_per_min"] == pytest.approx(600), "one in each of 10 lists per s"
-                assert found["stale_ghosts_per_min"] == pytest.approx(600)
+                assert found["false_positives_per_min"] == pytest.approx(600), "one in each of 10 lists per s"
+                assert found["stale_false_positives_per_min"] == pytest.approx(600)
                 assert found["position_rmse_m"] == pytest.approx(6.0)
                 assert found["position_rmse_captured_m"] == pytest.approx(0.0, abs=1e-6)
-                assert found["mtl_s"] == pytest.approx(2.0), "now it is never where it is said to be"
+                assert found["longest_gap_s"] == pytest.approx(2.0), "now it is never where it is said to be"
 
     def test_whose_word_it_was(self) -> None:
         """The ego's unit is 0.4 s late, the mast's 0.15 s: at 0.65 s there is 0.5 s from the mast, 0.2 s from the ego.

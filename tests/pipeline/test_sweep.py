@@ -167,24 +167,24 @@ class TestPoints:
         assert by_value[2]["mixed"].latency_s == {"ego": 0.0, "default": 0.3}
 
     def test_share_is_that_of_all_carriers(self) -> None:
-        fleet = {"on": {"classes": ["car"], "share": 0.3}, "pem": "p"}
-        other = {"on": {"classes": ["truck"], "share": 0.9}, "pem": "p"}
+        fleet = {"on": {"classes": ["car"], "penetration_rate": 0.3}, "pem": "p"}
+        other = {"on": {"classes": ["truck"], "penetration_rate": 0.9}, "pem": "p"}
         wanted = plan(
-            {"share": [0, 0.5, 1]},
+            {"penetration_rate": [0, 0.5, 1]},
             units=UNITS | {"fleet": fleet, "other": other},
             configurations=CONFIGURATIONS | {"fleet": {"units": ["fleet"]}},
         )
         zero, half, whole = only(wanted)
         assert [point.value for point in (zero, half, whole)] == [0, 0.5, 1]
-        assert half.experiment.units["fleet"].on == Carriers(classes=("car",), share=0.5)
-        assert half.experiment.units["other"].on == Carriers(classes=("truck",), share=0.5)
+        assert half.experiment.units["fleet"].on == Carriers(classes=("car",), penetration_rate=0.5)
+        assert half.experiment.units["other"].on == Carriers(classes=("truck",), penetration_rate=0.5)
         assert half.experiment.units["v2v"] == wanted.units["v2v"]
         assert list(half.experiment.configurations) == ["all", "late", "mixed", "fleet"], (
             "who hears of none is as it is"
         )
 
     def test_a_fleet_is_one_unit(self) -> None:
-        fleet = {"on": {"classes": ["car"], "share": 0.3}, "pem": "p"}
+        fleet = {"on": {"classes": ["car"], "penetration_rate": 0.3}, "pem": "p"}
         wanted = plan({"units": [0, 1]}, units={"ego": UNITS["ego"], "fleet": fleet},
                       configurations={"all": {"units": "all"}})  # fmt: skip
         assert [point.experiment.configurations["all"].units for point in points(wanted)] == [
@@ -217,7 +217,7 @@ class TestPoints:
         assert [(point.sweep, point.value) for point in points(wanted)] == [
             ("latency_s", 1), ("latency_s", 0), ("rate_hz", 20), ("rate_hz", 10), ("units", 3), ("units", 0),
         ]  # fmt: skip
-        assert KINDS == ("latency_s", "rate_hz", "units", "share")
+        assert KINDS == ("latency_s", "rate_hz", "units", "penetration_rate")
 
     @pytest.mark.parametrize(
         "sweep",
@@ -225,7 +225,7 @@ class TestPoints:
             {"configurations": ["GT"], "latency_s": [0, 1], "rate_hz": [5], "units": [1]},
             {"configurations": ["PEM"], "units": [0, 1]},
             {"configurations": ["masts"], "units": [0, 3]},
-            {"share": [0.5]},
+            {"penetration_rate": [0.5]},
         ],
     )
     def test_nothing_to_sweep(self, sweep: dict[str, Any]) -> None:
@@ -376,12 +376,12 @@ class TestResults:
     @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
     def test_share(self, share: float) -> None:
         def units(at: float) -> dict[str, Any]:
-            return UNITS | {"fleet": {"on": {"classes": ["car"], "share": at}, "pem": "p"}}
+            return UNITS | {"fleet": {"on": {"classes": ["car"], "penetration_rate": at}, "pem": "p"}}
 
         configurations = {"all": {"units": "all"}, "V2V": {"units": ["ego", "fleet"], "latency_s": {"fleet": 0.1}}}
-        found = swept({"share": [0.9, share]}, units=units(0.3), configurations=configurations)
+        found = swept({"penetration_rate": [0.9, share]}, units=units(0.3), configurations=configurations)
         expected = plainly(["all", "V2V"], units=units(share), configurations=configurations)
-        alike(rows_at(found, "share", share), expected)
+        alike(rows_at(found, "penetration_rate", share), expected)
 
     def test_several_hits(self) -> None:
         """Without exact times, which lists of several rates do not have."""
@@ -524,8 +524,8 @@ class TestFiles:
         assert written(tmp_path / "a", *names) == written(tmp_path / "b", *names)
 
     def test_jobs_do_not_matter(self, call: Call, tmp_path: Path) -> None:
-        fleet = "  mast: {on: {classes: [car], share: 0.5}, pem: onboard}"
-        text = changed("runs: 50", fleet, EXACT, SWEEP.replace("}", ", share: [0, 0.5, 1]}"))
+        fleet = "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}"
+        text = changed("runs: 50", fleet, EXACT, SWEEP.replace("}", ", penetration_rate: [0, 0.5, 1]}"))
         (tmp_path / "e.yaml").write_text(text)
         call("run", "e.yaml", "--out", "a", "--jobs", "1")
         call("run", "e.yaml", "--out", "b", "--jobs", "2")
@@ -537,8 +537,8 @@ class TestFiles:
         assert first == written(tmp_path / "b")
 
     def test_the_experiment_that_is_written_gives_the_same(self, call: Call, tmp_path: Path) -> None:
-        fleet = "  mast: {on: {classes: [car, vru], share: 0.5}, pem: onboard}"
-        chosen = SWEEP.replace("}", ", share: [0.25]}")
+        fleet = "  mast: {on: {classes: [car, vru], penetration_rate: 0.5}, pem: onboard}"
+        chosen = SWEEP.replace("}", ", penetration_rate: [0.25]}")
         (tmp_path / "d.yaml").write_text(changed(fleet, EXACT, chosen))
         call("run", "d.yaml", "--out", "c")
         call("run", "c/experiment.yaml", "--out", "d")
@@ -548,7 +548,7 @@ class TestFiles:
         assert by_default.sweep is not None
         assert by_default.sweep.chosen("latency_s") == ("coPEM",)
         assert by_default.sweep.chosen("rate_hz") == ("PEM", "coPEM")
-        chosen = SWEEP.replace("{", "{configurations: [coPEM], ").replace("}", ", share: [0.25]}")
+        chosen = SWEEP.replace("{", "{configurations: [coPEM], ").replace("}", ", penetration_rate: [0.25]}")
         (tmp_path / "e.yaml").write_text(changed(fleet, EXACT, chosen))
         call("run", "e.yaml", "--out", "a")
         said = call("run", "a/experiment.yaml", "--out", "b")
@@ -559,7 +559,7 @@ class TestFiles:
         assert wanted.sweep is not None
         assert wanted.sweep.configurations == ("coPEM",)
         assert wanted.sweep.latency_s == (0, 0.25, 0.1)
-        assert (wanted.sweep.rate_hz, wanted.sweep.units, wanted.sweep.share) == ((5, 20), (0, 1), (0.25,))
+        assert (wanted.sweep.rate_hz, wanted.sweep.units, wanted.sweep.penetration_rate) == ((5, 20), (0, 1), (0.25,))
 
 
 class TestCheck:
@@ -584,12 +584,12 @@ class TestCheck:
                     "19: sweep.units[3]: expected at most 1, the units beside the ego's; found 7",
                 ],
             ),
-            (["sweep: {share: [0.5]}"], ["19: sweep.share: no unit is `on: {classes, share}`"]),
-            (["  mast: {on: {classes: [car], share: 1}, pem: onboard}", "sweep: {share: [0.5]}"], []),
+            (["sweep: {penetration_rate: [0.5]}"], ["19: sweep.penetration_rate: no unit is `on: {classes, penetration_rate}`"]),
+            (["  mast: {on: {classes: [car], penetration_rate: 1}, pem: onboard}", "sweep: {penetration_rate: [0.5]}"], []),
             (
                 ["sweep: {}"],
                 [
-                    "19: sweep: expected values of latency_s, rate_hz, units or share, such as "
+                    "19: sweep: expected values of latency_s, rate_hz, units or penetration_rate, such as "
                     "`latency_s: [0, 0.5, 1]`"
                 ],
             ),
@@ -600,7 +600,7 @@ class TestCheck:
             (
                 ["sweep: {configurations: [PEM]}"],
                 [
-                    "19: sweep: expected values of latency_s, rate_hz, units or share, such as "
+                    "19: sweep: expected values of latency_s, rate_hz, units or penetration_rate, such as "
                     "`latency_s: [0, 0.5, 1]`"
                 ],
             ),
@@ -629,11 +629,11 @@ class TestCheck:
             (["sweep: {latency_s: [0, -1]}"], ["19: sweep.latency_s[1]: expected at least 0, found -1"]),
             (["sweep: {rate_hz: [0]}"], ["19: sweep.rate_hz[0]: expected at least 0.001, found 0"]),
             (
-                ["sweep: {units: [5], share: [2], configurations: [x]}"],
+                ["sweep: {units: [5], penetration_rate: [2], configurations: [x]}"],
                 [
-                    "19: sweep.share[0]: expected at most 1, found 2",
+                    "19: sweep.penetration_rate[0]: expected at most 1, found 2",
                     "19: sweep.configurations[0]: no configuration is named 'x'; there are GT, PEM, coPEM",
-                    "19: sweep.share: no unit is `on: {classes, share}`",
+                    "19: sweep.penetration_rate: no unit is `on: {classes, penetration_rate}`",
                     "19: sweep.units[0]: expected at most 1, the units beside the ego's; found 5",
                 ],
             ),
@@ -766,6 +766,6 @@ def test_a_sweep_that_changes_nothing_is_said() -> None:
         "sweep of latency_s: it changes no configuration; none states a latency above 0 or by unit, and `sweep: "
         "{configurations: […]}` does not name any"
     ) in found.notes
-    units = {"ego": UNITS["ego"], "buses": {"on": {"classes": ["bus"], "share": 0.5}, "pem": "p"}}
-    found = run(plan({"share": [0, 1]}, units=units, configurations={"all": {"units": "all"}}), [crossing()])
+    units = {"ego": UNITS["ego"], "buses": {"on": {"classes": ["bus"], "penetration_rate": 0.5}, "pem": "p"}}
+    found = run(plan({"penetration_rate": [0, 1]}, units=units, configurations={"all": {"units": "all"}}), [crossing()])
     assert any(note.endswith("unit buses: the log has nobody to carry it (bus)") for note in found.notes)

@@ -279,8 +279,8 @@ def test_a_folder_given_twice(tmp_path):
 
 @pytest.mark.parametrize("per_min", [-1.0, float("nan"), float("inf")])
 def test_a_rate_that_is_none(tmp_path, per_min):
-    (problem,) = problems(write_folder(tmp_path / "first", ROWS), ghosts_per_min=per_min)
-    assert problem == f"--ghosts-per-min: expected a number of at least 0, found {per_min:g}"
+    (problem,) = problems(write_folder(tmp_path / "first", ROWS), false_positives_per_min=per_min)
+    assert problem == f"--false-positives-per-min: expected a number of at least 0, found {per_min:g}"
 
 
 # ----------------------------------------------------------------------------------------------------- notes
@@ -326,7 +326,7 @@ def test_without_accuracy_the_rest_is_compared(tmp_path):
     second = write_folder(tmp_path / "second", ROWS)
     comparison = compare([first, second], baseline="first:ideal")
     by = comparison.table.groupby("configuration")["metric"].agg(set)
-    accuracy = ("position_rmse_m", "gospa_m", "ghosts_per_min", "ttd_rmst_s_equal_ghosts")
+    accuracy = ("position_rmse_m", "gospa_m", "false_positives_per_min", "ttd_rmst_s_equal_ghosts")
     assert by["first:late"] - by["second:late"] == set(accuracy)
     assert note_of("without accuracy", comparison.notes) == (
         f"{second}: no accuracy.parquet, instants.parquet, lists.parquet, thresholds.parquet (without accuracy, with "

@@ -18,8 +18,10 @@ from tests.helpers.compare_folders import Row, ghosts, limits_of, row, seen, ste
 FOUR = [None] * 4
 
 
-def compared(path: Path, rows: Sequence[Row], *, ghosts_per_min: float | None = None, **given: Any) -> Comparison:
-    return compare([write_folder(path / "study", rows, **given)], ghosts_per_min=ghosts_per_min)
+def compared(
+    path: Path, rows: Sequence[Row], *, false_positives_per_min: float | None = None, **given: Any
+) -> Comparison:
+    return compare([write_folder(path / "study", rows, **given)], false_positives_per_min=false_positives_per_min)
 
 
 def of(comparison: Comparison, metric: str) -> Any:
@@ -180,7 +182,7 @@ def test_ghosts_per_minute_are_of_all_minutes(tmp_path):
         ghosts("ideal", 1, **half), ghosts("ideal", 1, run=1, **half),
         ghosts("late", 3, **half), ghosts("late", 5, run=1, **half),
     ]  # fmt: skip
-    rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
+    rate = of(compared(tmp_path, rows, lists=lists), "false_positives_per_min")
     assert (rate["value"], rate["baseline_value"], rate["difference"], rate["n"]) == (8.0, 2.0, 6.0, 2)
     assert pd.isna(rate["interval_over"])
 
@@ -192,7 +194,7 @@ def test_ghosts_go_with_the_object_that_is_nearest_and_the_others_stay(tmp_path)
         for key, near in nearest.items()
         for name in ("ideal", "late")
     ]
-    rate = of(compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)]), "ghosts_per_min")
+    rate = of(compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)]), "false_positives_per_min")
     expected = limits_of([f"a\n{key}" for key in nearest], lambda drawn: 3 + sum(nearest[key[2:]] for key in drawn))
     assert rate["difference"] == 13.0
     assert rate["interval_over"] == "objects"
@@ -203,9 +205,9 @@ def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(t
     rows = [row(name, 1.0, 30.0, object_id=str(k)) for name in ("ideal", "late") for k in range(5)]
     comparison = compared(tmp_path, rows, lists=[ghosts("ideal", 0), ghosts("late", 13)])
     assert of(comparison, "detected_share")["interval_over"] == "objects"
-    assert pd.isna(of(comparison, "ghosts_per_min")["interval_over"])
+    assert pd.isna(of(comparison, "false_positives_per_min")["interval_over"])
     assert [note for note in comparison.notes if note.startswith("no interval")] == [
-        "no interval of ghosts_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+        "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
     ]
 
 
@@ -214,7 +216,7 @@ def test_ghosts_of_one_object_are_resampled_by_run(tmp_path):
     rows = [row(name, 1.0, 30.0, run=run) for name in ("ideal", "late") for run in range(5)]
     lists = [ghosts("late", n, run=run) for run, n in enumerate(counts)]
     lists += [ghosts("ideal", 1, run=run) for run in range(5)]
-    rate = of(compared(tmp_path, rows, lists=lists), "ghosts_per_min")
+    rate = of(compared(tmp_path, rows, lists=lists), "false_positives_per_min")
     expected = limits_of(
         [str(k) for k in range(5)], lambda drawn: float(np.mean([counts[int(run)] for run in drawn])) - 1
     )
@@ -230,7 +232,7 @@ STEPS = [step("ideal", 1.0, 0.5), step("late", 0.4, 1.0), step("late", 0.7, 3.0)
 
 def at_equal_ghosts(path: Path, per_min: float | None, *, lists: Sequence[Row] = LISTS, **of_late: Any) -> Comparison:
     rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0, **of_late)]
-    return compared(path, rows, lists=lists, steps=STEPS, ghosts_per_min=per_min)
+    return compared(path, rows, lists=lists, steps=STEPS, false_positives_per_min=per_min)
 
 
 @pytest.mark.parametrize(
@@ -266,10 +268,10 @@ def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_
 def test_the_rate_is_the_baselines_own_unless_given(tmp_path):
     lists = [ghosts("ideal", 20, existence=[0.0, 0.5, 0.9], ghosts_at=[20, 0, 0]), LISTS[1]]
     comparison = at_equal_ghosts(tmp_path, None, lists=lists)
-    assert comparison.ghosts_per_min == 20.0
+    assert comparison.false_positives_per_min == 20.0
     assert of(comparison, "ttd_rmst_s_equal_ghosts")["existence"] == 0.5
     back = compare([tmp_path / "study"], baseline="late")
-    assert back.ghosts_per_min == 60.0
+    assert back.false_positives_per_min == 60.0
     assert of(back, "ttd_rmst_s_equal_ghosts")["difference"] == -0.5
 
 
@@ -318,10 +320,10 @@ SURE = [step("ideal", 1.0, 0.5), step("late", 0.9, 3.0)]
 )
 def test_where_equal_ghosts_say_nothing_there_is_none(tmp_path, per_min, lists, steps, why):
     rows = [row("ideal", 0.5, 30.0), row("late", 1.0, 30.0)]
-    comparison = compared(tmp_path, rows, lists=lists, steps=steps, ghosts_per_min=per_min)
+    comparison = compared(tmp_path, rows, lists=lists, steps=steps, false_positives_per_min=per_min)
     assert why in comparison.notes
     assert "ttd_rmst_s_equal_ghosts" not in set(comparison.table["metric"])
-    assert "ghosts_per_min" in set(comparison.table["metric"])
+    assert "false_positives_per_min" in set(comparison.table["metric"])
 
 
 def test_of_the_truth_nothing_is_at_equal_ghosts(tmp_path):
@@ -330,7 +332,7 @@ def test_of_the_truth_nothing_is_at_equal_ghosts(tmp_path):
     (folder / "experiment.yaml").write_text(
         "version: 1\nconfigurations:\n  ideal: {units: truth}\n  late: {units: all}\n"
     )
-    comparison = compare([folder], ghosts_per_min=20)
+    comparison = compare([folder], false_positives_per_min=20)
     assert f"late: {NONE}the baseline is the truth, which has no ghosts" in comparison.notes
     assert "ttd_rmst_s_equal_ghosts" not in set(comparison.table["metric"])
 
@@ -363,7 +365,7 @@ def test_the_same_folder_again_differs_in_nothing(tmp_path):
     comparison = compare(folders, baseline="first:x")
     assert comparison.table["metric"].tolist() == [
         "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
-        "ghosts_per_min",
+        "false_positives_per_min",
     ]  # fmt: skip
     assert (comparison.table["difference"] == 0.0).all()
     # None of six can differ, one way or the other, where up to 46 % of all do: 1 − 0.025^(1/6).

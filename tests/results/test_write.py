@@ -58,10 +58,10 @@ ACCURACY = {
     "bias_north_m": pa.float64(),
     "velocity_rmse_mps": pa.float64(),
     "nees": pa.float64(),
-    "age_s": pa.float64(),
+    "age_of_information_s": pa.float64(),
     "identity_switches": pa.float64(),
     "duplicates": pa.int64(),
-    "mtl_s": pa.float64(),
+    "longest_gap_s": pa.float64(),
 }
 SUMMARY = [
     "configuration", "n", "list_rate_hz", "detected_share", "detected_share_low", "detected_share_high", "interval",
@@ -69,10 +69,10 @@ SUMMARY = [
     "dad_p5_m",
 ]  # fmt: skip
 FIGURES = [
-    "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps", "age_s",
-    "gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m", "ospa_m", "ghosts_per_min",
-    "stale_ghosts_per_min", "duplicates_per_min", "nees", "nees_expected", "nees_low", "nees_high", "beyond_gate_share",
-    "existence_error", "identity_switches", "mtl_s",
+    "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps", "age_of_information_s",
+    "gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m", "ospa_m", "false_positives_per_min",
+    "stale_false_positives_per_min", "duplicates_per_min", "nees", "nees_expected", "nees_low", "nees_high", "beyond_gate_share",
+    "existence_ece", "identity_switches", "longest_gap_s",
 ]  # fmt: skip
 TABLES = {"accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet", "bands.csv"}
 
@@ -120,7 +120,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     assert (left["matched_lists"], left["duplicates"]) == (0, 0)
     for name in ("detection_s", "captured_s", "time_to_detection_s", "distance_at_detection_m", "first_unit",
                  "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps",
-                 "nees", "age_s", "identity_switches"):  # fmt: skip
+                 "nees", "age_of_information_s", "identity_switches"):  # fmt: skip
         assert left[name] is None, f"{name}: what does not exist is null"
     with (folder / "summary.csv").open(newline="") as file:
         summary = list(csv.DictReader(file))
@@ -206,11 +206,11 @@ def test_the_files_of_accuracy_say_the_same_as_rows_and_summary(two_logs: list[P
         assert row["gospa_m"] ** 2 == pytest.approx(np.mean(gospa[str(name)]), abs=ROUNDED)
         mine = [r for r in by_run if r["configuration"] == name]
         minutes = sum(r["minutes"] for r in mine)
-        assert row["ghosts_per_min"] == pytest.approx(sum(r["ghosts"] for r in mine) / minutes)
+        assert row["false_positives_per_min"] == pytest.approx(sum(r["ghosts"] for r in mine) / minutes)
         assert row["duplicates_per_min"] == pytest.approx(sum(r["duplicates"] for r in mine) / minutes)
     assert summary.loc["GT", "gospa_m"] == 0
     assert summary.loc["union", "duplicates_per_min"] > 0
-    assert summary.loc["union", "ghosts_per_min"] > 0
+    assert summary.loc["union", "false_positives_per_min"] > 0
     for row in by_run:
         at = row["ghosts_at"]
         assert at == sorted(at, reverse=True)

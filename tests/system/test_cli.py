@@ -117,8 +117,8 @@ class TestUsage:
             (["run", "e.yaml", "--jobs", "0"], "Invalid value for '--jobs': "),
             (["run", "e.yaml", "--jobs", "1000000"], "Invalid value for '--jobs': "),
             (["compare"], "Missing argument 'DIR...'."),
-            (["compare", "out", "--ghosts-per-min", "-1"], "Invalid value for '--ghosts-per-min': "),
-            (["compare", "out", "--ghosts-per-min", "few"], "Invalid value for '--ghosts-per-min': "),
+            (["compare", "out", "--false-positives-per-min", "-1"], "Invalid value for '--false-positives-per-min': "),
+            (["compare", "out", "--false-positives-per-min", "few"], "Invalid value for '--false-positives-per-min': "),
             (["view"], "Missing argument 'DIR'."),
             (["schema", "all"], "unexpected extra argument"),
         ],
@@ -760,8 +760,8 @@ class TestCompare:
         assert ended.lines == [f"note: {note}" for note in found.notes]
 
     def test_of_some_configurations_into_a_file(self, fused: Path, call: Call) -> None:
-        options = ["--baseline", "coPEM", "--configurations", "PEM", "--ghosts-per-min", "3"]
-        found = compare([fused / "out/e"], baseline="coPEM", configurations=["PEM"], ghosts_per_min=3.0)
+        options = ["--baseline", "coPEM", "--configurations", "PEM", "--false-positives-per-min", "3"]
+        found = compare([fused / "out/e"], baseline="coPEM", configurations=["PEM"], false_positives_per_min=3.0)
         for name in ("c.csv", "c.md"):
             ended = call("compare", "out/e", *options, "--out", name)
             assert ended.code == 0

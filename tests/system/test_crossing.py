@@ -451,7 +451,7 @@ def test_the_better_a_fusion_the_fewer_duplicates(fused: pd.DataFrame) -> None:
             found = fused.loc[names, figure].tolist()
             assert found == sorted(found, reverse=True), (late, figure)
         alike = fused[fused.index.str.endswith(":mixed") == bool(late)]
-        assert alike["ghosts_per_min"].idxmin() == f"ideal{late}"
+        assert alike["false_positives_per_min"].idxmin() == f"ideal{late}"
 
 
 def test_trackers_remember_and_so_miss_less(fused: pd.DataFrame) -> None:

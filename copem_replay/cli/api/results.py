@@ -41,11 +41,11 @@ def compare(
     *,
     configurations: Sequence[str] | None = None,
     baseline: str | None = None,
-    ghosts_per_min: float | None = None,
+    false_positives_per_min: float | None = None,
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
-    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `ghosts_per_min`: false positives
+    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `false_positives_per_min`: false positives
     per minute at which times to detection are compared once more; None: those of the baseline. `table` of the result
     has a row per log, configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
 
@@ -63,7 +63,7 @@ def compare(
         [folder_of(one) for one in several],
         configurations=configurations,
         baseline=baseline,
-        ghosts_per_min=ghosts_per_min,
+        false_positives_per_min=false_positives_per_min,
     )
 
 
@@ -93,12 +93,15 @@ def view(results: AnyResults) -> None:
     """
     import subprocess
 
+    from copem_replay.results.read import check_format
+
     folder = folder_of(results)
     place = folder.absolute()  # no name that looks like an option
     patterns = ("replay.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
     files = [path for pattern in patterns for path in sorted(place.glob(pattern)) if path.is_file()]
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
+    check_format(folder)
     if not files:
         raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
     # The module, not the script: it is there in every environment that has rerun-sdk, whatever the PATH.

@@ -162,8 +162,8 @@ def add_up(
                     entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m
                 )
                 beyond, mean, second = expected(large_m2, small_m2, asked.gate_m)
-                square_m2, age_s = then_east_m**2 + then_north_m**2, issue_s[k] - entry.captured_s
-                _further(sums, entry, square_m2, beyond, second, age_s, m, so_far.last_track[s])
+                square_m2, age_of_information_s = then_east_m**2 + then_north_m**2, issue_s[k] - entry.captured_s
+                _further(sums, entry, square_m2, beyond, second, age_of_information_s, m, so_far.last_track[s])
                 east_m = north_m = np.nan
                 if p >= 0:
                     east_m, north_m = entry.x_m - world.x_m[p], entry.y_m - world.y_m[p]
@@ -186,7 +186,7 @@ def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
         for m in range(M):
             if not np.isnan(so_far.unknown_since_s[s, m]):
                 sums = out.by_object[s, m]
-                sums.mtl_s = max(sums.mtl_s, stays.ended_s[m] - so_far.unknown_since_s[s, m])
+                sums.longest_gap_s = max(sums.longest_gap_s, stays.ended_s[m] - so_far.unknown_since_s[s, m])
 
 
 @nb.njit(cache=True, nogil=True)
@@ -295,19 +295,26 @@ def _follow(sums: Any, m: int, match: int, issue_s: float, stays: Stays, unknown
         if np.isnan(unknown_since_s[m]):
             unknown_since_s[m] = now_s
     elif not np.isnan(unknown_since_s[m]):
-        sums.mtl_s = max(sums.mtl_s, now_s - unknown_since_s[m])
+        sums.longest_gap_s = max(sums.longest_gap_s, now_s - unknown_since_s[m])
         unknown_since_s[m] = np.nan
 
 
 @nb.njit(cache=True, nogil=True)
 def _further(
-    sums: Any, entry: Any, square_then_m2: float, beyond: float, second: float, age_s: float, m: int, last_track: Int
+    sums: Any,
+    entry: Any,
+    square_then_m2: float,
+    beyond: float,
+    second: float,
+    age_of_information_s: float,
+    m: int,
+    last_track: Int,
 ) -> None:
     # What only objects add up.
     sums.square_then_m2 += square_then_m2
     sums.beyond_gate += beyond
     sums.nees_square_expected += second
-    sums.age_s += age_s
+    sums.age_of_information_s += age_of_information_s
     track = entry.track_id
     if track >= 0:
         sums.tracked += 1

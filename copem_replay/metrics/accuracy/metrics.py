@@ -50,9 +50,9 @@ def bias_north_m(of: Total) -> float | None:
     return _ratio(of.looks["north_m"], of.looks["placed"])
 
 
-def age_s(of: Total) -> float | None:
+def age_of_information_s(of: Total) -> float | None:
     """Mean over pairs."""
-    return _ratio(of.looks["age_s"], of.looks["pairs"])
+    return _ratio(of.looks["age_of_information_s"], of.looks["pairs"])
 
 
 def nees(of: Total) -> float | None:
@@ -96,9 +96,9 @@ def identity_switches(of: Total) -> float | None:
     return _ratio(of.looks["switches"], of.tracked_rows)
 
 
-def mtl_s(of: Total) -> float | None:
+def longest_gap_s(of: Total) -> float | None:
     """Mean over looks and runs."""
-    return _ratio(of.looks["mtl_s"], of.rows)
+    return _ratio(of.looks["longest_gap_s"], of.rows)
 
 
 def _gospa(of: Total, sums: float) -> float | None:
@@ -131,12 +131,12 @@ def ospa_m(of: Total) -> float | None:
     return _ratio(of.runs["ospa_m"], of.runs["lists_looked"])
 
 
-def ghosts_per_min(of: Total) -> float | None:
+def false_positives_per_min(of: Total) -> float | None:
     """Entries, so that a ghost counts in each list it is in."""
     return _ratio(60 * of.runs["ghosts"], of.runs["time_s"])
 
 
-def stale_ghosts_per_min(of: Total) -> float | None:
+def stale_false_positives_per_min(of: Total) -> float | None:
     """Of these the ones that were about some object at the instant they tell of."""
     return _ratio(60 * of.runs["stale_ghosts"], of.runs["time_s"])
 
@@ -146,7 +146,7 @@ def duplicates_per_min(of: Total) -> float | None:
     return _ratio(60 * of.runs["duplicates"], of.runs["time_s"])
 
 
-def existence_error(of: Total) -> float | None:
+def existence_ece(of: Total) -> float | None:
     """Expected calibration error, 0 … 1."""
     bins = of.by_existence
     return _ratio(np.abs(bins["with_object"] - bins["existence"]).sum(), bins["entries"].sum())
@@ -164,7 +164,7 @@ ACCURACY = (
     Metric("bias_east_m", _TOTAL, bias_east_m, 0, "mean easting error, entry minus truth"),
     Metric("bias_north_m", _TOTAL, bias_north_m, 0, "mean northing error, entry minus truth"),
     Metric("velocity_rmse_mps", _TOTAL, velocity_rmse_mps, -1, "of velocities", "accuracy"),
-    Metric("age_s", _TOTAL, age_s, -1, "available minus captured, mean", "accuracy"),
+    Metric("age_of_information_s", _TOTAL, age_of_information_s, -1, "available minus captured, mean", "accuracy"),
     Metric("gospa_m", _TOTAL, gospa_m, -1,
            "GOSPA of the lists: places, misses and false entries in one number", "lists",
            "GOSPA, over lists that both have"),
@@ -172,9 +172,9 @@ ACCURACY = (
     Metric("gospa_missed_m", _TOTAL, gospa_missed_m, -1, "the part of GOSPA that is of misses"),
     Metric("gospa_false_m", _TOTAL, gospa_false_m, -1, "the part of GOSPA that is of false entries"),
     Metric("ospa_m", _TOTAL, ospa_m, -1, "OSPA of the lists, mean"),
-    Metric("ghosts_per_min", _TOTAL, ghosts_per_min, -1,
+    Metric("false_positives_per_min", _TOTAL, false_positives_per_min, -1,
            "entries at no object, per minute of log", "lists", "entries at no object, per minute"),
-    Metric("stale_ghosts_per_min", _TOTAL, stale_ghosts_per_min, -1,
+    Metric("stale_false_positives_per_min", _TOTAL, stale_false_positives_per_min, -1,
            "of these, at an object when they were captured", "lists"),
     Metric("duplicates_per_min", _TOTAL, duplicates_per_min, -1,
            "second entries at an object, per minute of log", "lists"),
@@ -186,8 +186,8 @@ ACCURACY = (
     Metric("nees_high", _TOTAL, nees_high, 0, "upper limit of nees where covariances are true, 95 %"),
     Metric("beyond_gate_share", _TOTAL, beyond_gate_share, 0,
            "of errors as the claimed covariances have them, how many the gate lets not through"),
-    Metric("existence_error", _TOTAL, existence_error, -1, "expected calibration error of the claimed existence"),
+    Metric("existence_ece", _TOTAL, existence_ece, -1, "expected calibration error of the claimed existence"),
     Metric("identity_switches", _TOTAL, identity_switches, -1, "matches by another track than the last one, mean"),
-    Metric("mtl_s", _TOTAL, mtl_s, -1, "longest time unknown, mean", "lists"),
+    Metric("longest_gap_s", _TOTAL, longest_gap_s, -1, "longest time unknown, mean", "lists"),
 )  # fmt: skip
 """The metrics of accuracy, in the order of the columns."""

@@ -84,17 +84,17 @@ OBJECT = np.dtype(
         ("beyond_gate", "f8"),
         ("square_then_m2", "f8"),  # at the instants the entries tell of
         ("velocity_square_m2ps2", "f8"),  # of placed ones
-        ("age_s", "f8"),
+        ("age_of_information_s", "f8"),
         ("tracked", "i8"),  # pairs whose entry names a track
         ("switches", "i8"),
         ("duplicates", "i8"),
-        ("mtl_s", "f8"),
+        ("longest_gap_s", "f8"),
         ("gospa_localisation", "f8"),  # m to the power p, as the next two
         ("gospa_missed", "f8"),
         ("gospa_false", "f8"),
     ]
 )
-"""The same of one look, and further sums (`mtl_s`: the longest)."""
+"""The same of one look, and further sums (`longest_gap_s`: the longest)."""
 
 RUN = np.dtype(
     [

@@ -30,7 +30,7 @@ AXES = {
     "latency_s": "Latency (s)",
     "rate_hz": "Rate of the units (lists per second)",
     "units": "Number of units",
-    "share": "Share of vehicles that carry a unit",
+    "penetration_rate": "Share of vehicles that carry a unit",
 }
 _ROWS = {
     "pass_share": "Share that passes",
@@ -149,7 +149,7 @@ def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
     if kind == "rate_hz" and values[0] > 0 and values[-1] / values[0] >= 8:
         axes.set_xscale("log", base=2)
         axes.set_xticks(values, [f"{value:g}" for value in values], minor=False)
-    if kind == "share":
+    if kind == "penetration_rate":
         axes.xaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
     axes.set_xlabel(AXES.get(kind, kind))
 

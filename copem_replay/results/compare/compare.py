@@ -67,7 +67,7 @@ class Comparison:
     """Differences to a baseline: a row per log (`all`, and each where there are several), configuration and metric.
 
     Columns of `table` as in COLUMNS, missing where there is none; times are up to `horizon_s`, those at equal ghosts at
-    `ghosts_per_min`. `notes`: what has to be said, a line each.
+    `false_positives_per_min`. `notes`: what has to be said, a line each.
 
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
@@ -78,7 +78,7 @@ class Comparison:
     baseline: str
     configurations: tuple[str, ...]
     horizon_s: float
-    ghosts_per_min: float | None
+    false_positives_per_min: float | None
     notes: tuple[str, ...]
 
     @property
@@ -92,22 +92,24 @@ def compare(
     *,
     configurations: Sequence[str] | None = None,
     baseline: str | None = None,
-    ghosts_per_min: float | None = None,
+    false_positives_per_min: float | None = None,
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline (None: `ideal`), pair by pair.
 
-    `ghosts_per_min`: at which times to detection are compared once more; None: as many as the baseline has. Raises
+    `false_positives_per_min`: at which times to detection are compared once more; None: as many as the baseline has. Raises
     InputError, a line for every reason why something cannot be read or compared.
     """
-    if ghosts_per_min is not None and not 0 <= ghosts_per_min < math.inf:
-        raise InputError(f"--ghosts-per-min: expected a number of at least 0, found {ghosts_per_min:g}")
+    if false_positives_per_min is not None and not 0 <= false_positives_per_min < math.inf:
+        raise InputError(
+            f"--false-positives-per-min: expected a number of at least 0, found {false_positives_per_min:g}"
+        )
     read = read_folders(folders)
     check_comparable(read)
     grid = grid_of(read)
     against, *others = chosen(named(read), configurations, baseline)
     used = list(dict.fromkeys(one.results for one in (against, *others)))
     second = side_of(against, grid)
-    setting = _setting(read, second, ghosts_per_min)
+    setting = _setting(read, second, false_positives_per_min)
     draws = Draws(read[0].provenance.seed)
     rows: list[dict[str, object]] = []
     sides: list[Side] = []
@@ -119,10 +121,10 @@ def compare(
         cells = np.flatnonzero(first.there & second.there)
         pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
         reasons[one.label] = why_not(
-            first, second, setting.ghosts_per_min, asked=ghosts_per_min is not None,
+            first, second, setting.false_positives_per_min, asked=false_positives_per_min is not None,
             truth=against.configuration in against.results.truth,
         )  # fmt: skip
-        mine = setting if reasons[one.label] is None else replace(setting, ghosts_per_min=None)
+        mine = setting if reasons[one.label] is None else replace(setting, false_positives_per_min=None)
         for regret in regrets(first, second, grid, mine):
             names = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
             fixed = _fixed(regret.metric, one, against)
@@ -135,28 +137,28 @@ def compare(
         baseline=against.label,
         configurations=tuple(one.label for one in others),
         horizon_s=setting.horizon_s,
-        ghosts_per_min=setting.ghosts_per_min,
+        false_positives_per_min=setting.false_positives_per_min,
         notes=(
             *notes_on_folders(used),
             *notes_on_pairs(against.label, second.there, {side.label: side.there for side in sides}),
             *note_on_measuring(against, others),
             *notes_on_instants(second, sides, grid.logs),
             *notes_on_equal_ghosts(reasons),
-            *notes_on_rows(table, setting.ghosts_per_min),
+            *notes_on_rows(table, setting.false_positives_per_min),
         ),
     )
 
 
-def _setting(folders: Sequence[Results], baseline: Side, ghosts_per_min: float | None) -> Setting:
+def _setting(folders: Sequence[Results], baseline: Side, false_positives_per_min: float | None) -> Setting:
     """What holds for all pairs; the longest look is that of any folder."""
     measure = folders[0].provenance.measure
     horizon_s = measure["horizon_s"]
     if horizon_s is None:
         used_s = [one.provenance.horizon_used_s for one in folders if one.provenance.horizon_used_s is not None]
         horizon_s = max(used_s) if used_s else float(np.nanmax(baseline.ended_s - baseline.onset_s))
-    if ghosts_per_min is None and baseline.ghosts is not None:
-        ghosts_per_min = own_rate(baseline.ghosts)
-    return Setting(float(horizon_s), float(measure["gospa"]["power"]), ghosts_per_min)
+    if false_positives_per_min is None and baseline.ghosts is not None:
+        false_positives_per_min = own_rate(baseline.ghosts)
+    return Setting(float(horizon_s), float(measure["gospa"]["power"]), false_positives_per_min)
 
 
 def _check_same_looks(one: Named, first: Side, against: Named, second: Side, grid: Grid) -> None:
@@ -205,7 +207,7 @@ def _row(regret: Regret, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool) 
         row["p_value"] = mcnemar(int(only[0]), int(only[1])) if len(figure.only) else None
     if regret.kept is not None:
         for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
-            row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.ghosts_per_min
+            row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.false_positives_per_min
     return row
 
 

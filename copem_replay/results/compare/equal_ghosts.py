@@ -39,7 +39,7 @@ def why_not(first: Side, second: Side, per_min: float | None, *, asked: bool, tr
         if not _tells_apart(side.ghosts, side.steps):
             return ONE_VALUE if side is first else f"of the baseline, {ONE_VALUE}"
         minutes = float(side.ghosts.minutes[side.ghosts.there].sum())
-        if kept.ghosts_per_min * minutes < FEWEST_GHOSTS * (1 - 1e-9):
+        if kept.false_positives_per_min * minutes < FEWEST_GHOSTS * (1 - 1e-9):
             return FEW
     return None
 

@@ -33,7 +33,7 @@ from copem_replay.results.compare.per_list import together
 
 METRICS = {name: METRIC[name.removesuffix("_equal_ghosts")].better for name in (
     "detected_share", "ttd_rmst_s", "ttd_rmst_s_equal_ghosts", "dad_median_m", "position_rmse_m", "gospa_m",
-    "ghosts_per_min", "pass_share",
+    "false_positives_per_min", "pass_share",
 )}  # fmt: skip
 """All metrics, and whether more (1) or less (−1) is better."""
 
@@ -44,7 +44,7 @@ class Setting:
 
     horizon_s: float
     power: float
-    ghosts_per_min: float | None
+    false_positives_per_min: float | None
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Kept:
     existence: float
     above: float  # inf: nothing
     share: float
-    ghosts_per_min: float
+    false_positives_per_min: float
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def regrets(first: Side, second: Side, grid: Grid, setting: Setting) -> Iterator
     yield Regret("dad_median_m", _distances(first, second, grid, cells))
     yield from _of_lists(first, second, grid, cells, setting.power)
     if first.ghosts is not None and second.ghosts is not None:
-        yield Regret("ghosts_per_min", _ghosts(first, second, first.ghosts, second.ghosts, grid, cells))
+        yield Regret("false_positives_per_min", _ghosts(first, second, first.ghosts, second.ghosts, grid, cells))
     if first.conflict is not None and second.conflict is not None:
         assert first.passes is not None
         assert second.passes is not None
@@ -159,9 +159,9 @@ def own_rate(ghosts: Ghosts) -> float | None:
 def _at_equal_ghosts(first: Side, second: Side, grid: Grid, cells: Int, setting: Setting) -> Iterator[Regret]:
     kept, times = [], []
     for side in (first, second):
-        if side.ghosts is None or side.steps is None or setting.ghosts_per_min is None:
+        if side.ghosts is None or side.steps is None or setting.false_positives_per_min is None:
             return
-        found = kept_at(side.ghosts, setting.ghosts_per_min)
+        found = kept_at(side.ghosts, setting.false_positives_per_min)
         if found is None:
             return
         kept.append(found)

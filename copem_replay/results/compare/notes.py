@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _NEEDED = {
     "position_rmse_m": {"accuracy.parquet", "instants.parquet"},
     "gospa_m": {"accuracy.parquet", "instants.parquet"},
-    "ghosts_per_min": {"lists.parquet"},
+    "false_positives_per_min": {"lists.parquet"},
     "ttd_rmst_s_equal_ghosts": {"lists.parquet", "thresholds.parquet"},
 }
 
@@ -89,10 +89,10 @@ def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
     overall = table.drop_duplicates(["configuration", "metric"])
     without = overall[overall["difference"].notna() & overall["interval"].isna()]
     with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
-    nameless = (without["metric"] == "ghosts_per_min") & without["configuration"].isin(with_interval)
+    nameless = (without["metric"] == "false_positives_per_min") & without["configuration"].isin(with_interval)
     if nameless.any():
         yield (
-            "no interval of ghosts_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+            "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
         )
     without = without[~nameless]
     if len(without):
