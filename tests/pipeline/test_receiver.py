@@ -199,8 +199,8 @@ class TestInTheHead:
         """The ego's unit is 0.4 s late, the mast's 0.15 s: at 0.65 s there is 0.5 s from the mast, 0.2 s from the ego.
 
         In the union the ego's entry is the match, being the first unit's, and of before the onset; the mast's beside it
-        tells since when the car is known, as ideal fusion has it. Suppression keeps the newer of equals. The cluster has
-        both: it is as new as its newest, and the ego's arrived first.
+        tells since when the car is known, as ideal fusion has it. Suppression keeps the newer of equals. The cluster
+        has both: it is as new as its newest, and the ego's arrived first.
         """
         late = configurations("union", "nms", "gnn", latency_s={"ego": 0.4, "mast": 0.15})
         surer = {"p": pems()["p"], "q": pems(existence=0.95)["p"]}
