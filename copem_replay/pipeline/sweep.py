@@ -1,8 +1,9 @@
 """Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
 
-A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units themselves.
-Configurations that it leaves as they are, or makes equal to one before, are left out. A latency is varied only where
-there is one (above 0, or by unit) or where the configuration is named: who hears of nobody over the air has none.
+A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units
+themselves. Configurations that it leaves as they are, or makes equal to one before, are left out. A latency is varied
+only where there is one (above 0, or by unit) or where the configuration is named: who hears of nobody over the air has
+none.
 """
 
 from __future__ import annotations

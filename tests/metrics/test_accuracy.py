@@ -347,7 +347,8 @@ def test_before_the_first_list_it_is_unknown() -> None:
 
 def test_never_matched() -> None:
     of = assessed([NOTHING] * 3, places={CAR: standing(10, 0, 3)}, looks={CAR: (0, 2)})
-    for name in ("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps", "age_of_information_s", "nees",
+    for name in ("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps",
+                 "age_of_information_s", "nees",
                  "nees_low", "nees_high", "identity_switches", "existence_ece"):  # fmt: skip
         assert figure(name, of) is None, name
     assert figure("longest_gap_s", of) == pytest.approx(2.0)

@@ -584,8 +584,15 @@ class TestCheck:
                     "19: sweep.units[3]: expected at most 1, the units beside the ego's; found 7",
                 ],
             ),
-            (["sweep: {penetration_rate: [0.5]}"], ["19: sweep.penetration_rate: no unit is `on: {classes, penetration_rate}`"]),
-            (["  mast: {on: {classes: [car], penetration_rate: 1}, pem: onboard}", "sweep: {penetration_rate: [0.5]}"], []),
+            (
+                ["sweep: {penetration_rate: [0.5]}"],
+                ["19: sweep.penetration_rate: no unit is `on: {classes, penetration_rate}`"],
+            ),
+            (
+                ["  mast: {on: {classes: [car], penetration_rate: 1}, pem: onboard}",
+                 "sweep: {penetration_rate: [0.5]}"],
+                [],
+            ),
             (
                 ["sweep: {}"],
                 [

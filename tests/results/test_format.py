@@ -45,5 +45,5 @@ def test_a_key_that_has_another_name_is_refused_with_it(tmp_path: Path) -> None:
     said = [line for line in failure.value.problems if "is called" in line]
     assert [line.partition("e.yaml:")[2] for line in said] == [
         "12: units.mast.on.share: `share` is called `penetration_rate` now",
-        "18: sweep.share: `share` is called `penetration_rate` now",
+        "19: sweep.share: `share` is called `penetration_rate` now",
     ]

@@ -207,7 +207,8 @@ def test_where_it_is_not_known_whose_ghosts_they_are_objects_are_not_resampled(t
     assert of(comparison, "detected_share")["interval_over"] == "objects"
     assert pd.isna(of(comparison, "false_positives_per_min")["interval_over"])
     assert [note for note in comparison.notes if note.startswith("no interval")] == [
-        "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+        "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is "
+        "nearest to"
     ]
 
 

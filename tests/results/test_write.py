@@ -69,9 +69,11 @@ SUMMARY = [
     "dad_p5_m",
 ]  # fmt: skip
 FIGURES = [
-    "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps", "age_of_information_s",
+    "position_rmse_m", "position_rmse_captured_m", "bias_east_m", "bias_north_m", "velocity_rmse_mps",
+    "age_of_information_s",
     "gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m", "ospa_m", "false_positives_per_min",
-    "stale_false_positives_per_min", "duplicates_per_min", "nees", "nees_expected", "nees_low", "nees_high", "beyond_gate_share",
+    "stale_false_positives_per_min", "duplicates_per_min", "nees", "nees_expected", "nees_low", "nees_high",
+    "beyond_gate_share",
     "existence_ece", "identity_switches", "longest_gap_s",
 ]  # fmt: skip
 TABLES = {"accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet", "bands.csv"}

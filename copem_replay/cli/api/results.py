@@ -45,9 +45,10 @@ def compare(
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
-    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `false_positives_per_min`: false positives
-    per minute at which times to detection are compared once more; None: those of the baseline. `table` of the result
-    has a row per log, configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval.
+    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`. `false_positives_per_min`: false
+    positives per minute at which times to detection are compared once more; None: those of the baseline. `table` of the
+    result has a row per log, configuration and metric: `difference` with the limits `low` and `high` of its 95 %
+    interval.
 
     Raises InputError with every reason why the results are unreadable or not comparable.
 

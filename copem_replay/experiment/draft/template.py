@@ -203,7 +203,7 @@ def _units(
     for name, mast in zip(("roadside", "across"), guess.masts[: 1 if ego else 2], strict=False):
         yield f"  {name}: {{at: {_list(mast.at)}, yaw_deg: {mast.yaw_deg}, height_m: 6.0, pem: roadside}}"
     if ego:
-        yield "  # others: {on: {classes: [car, truck], penetration_rate: 0.3}, pem: onboard}   # carried by 30 % of them (V2V)"
+        yield "  # others: {on: {classes: [car, truck], penetration_rate: 0.3}, pem: onboard}   # 30 % of them (V2V)"
     if recorded:
         yield "  # Lists as they were recorded. `delay_s`, `covariance_m2`: for messages that don't say when they were"
         yield "  # captured, and how uncertain they are."

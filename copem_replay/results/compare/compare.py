@@ -96,8 +96,8 @@ def compare(
 ) -> Comparison:
     """Compare configurations (None: all) with a baseline (None: `ideal`), pair by pair.
 
-    `false_positives_per_min`: at which times to detection are compared once more; None: as many as the baseline has. Raises
-    InputError, a line for every reason why something cannot be read or compared.
+    `false_positives_per_min`: at which times to detection are compared once more; None: as many as the baseline has.
+    Raises InputError, a line for every reason why something cannot be read or compared.
     """
     if false_positives_per_min is not None and not 0 <= false_positives_per_min < math.inf:
         raise InputError(

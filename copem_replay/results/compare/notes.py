@@ -92,7 +92,8 @@ def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
     nameless = (without["metric"] == "false_positives_per_min") & without["configuration"].isin(with_interval)
     if nameless.any():
         yield (
-            "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is nearest to"
+            "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is "
+            "nearest to"
         )
     without = without[~nameless]
     if len(without):

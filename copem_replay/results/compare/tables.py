@@ -113,7 +113,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     if "ttd_rmst_s_equal_ghosts" in shown:
         yield (
             "ttd_rmst_s_equal_ghosts: that mean as matches tell, of ideal fusion and the truth too, with so many of "
-            f"the least certain entries of each left out that {comparison.false_positives_per_min:.4g} ghosts per minute "
+            f"the least certain entries of each left out that {comparison.false_positives_per_min:.4g} ghosts per "
+            "minute "
             "remain, stale ones not counted"
         )
     for metric, better in METRICS.items():
