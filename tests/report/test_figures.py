@@ -259,7 +259,11 @@ class TestCommand:
             ),
             ("detections.parquet", None, ": expected a results folder, found no detections.parquet in it; "),
             ("provenance.json", b"{", "/provenance.json: expected the provenance of results, found damage: "),
-            ("provenance.json", b"{}", "/provenance.json: expected the provenance of results, found damage: no 'logs'"),
+            (
+                "provenance.json",
+                b'{"format": 2}',
+                "/provenance.json: expected the provenance of results, found damage: no 'logs'",
+            ),
             ("summary.csv", b"a,b\n1,2\n", "/summary.csv: expected the column configuration, found none; run the "),
             ("summary.csv", b"", "/summary.csv: expected a table that can be read, found damage: "),
             ("summary.csv", b"configuration,n,list_rate_hz\nGT,3,x\n", "/summary.csv: column list_rate_hz: expected "),
