@@ -114,7 +114,7 @@ def test_channels_and_records(written: Written) -> None:
     for key, value in metadata(SOURCE)[OSI_RECORD].items():
         if not key.startswith(("min_", "max_")):
             assert osi[key] == value
-    ours = metadata(written.path)[RUN_RECORD]
+    ours = metadata(written.path)["org.copem_replay.run"]  # a name of the file format, whatever modules are called
     assert ours["run"] == str(RUN)
     assert sorted(v for k, v in ours.items() if k.startswith("unit.")) == sorted(["truth", *written.experiment.units])
 

@@ -32,7 +32,7 @@ from copem_replay.io.write.source import Source, source_of
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
-RUN_RECORD = "org.copem_replay.pipeline.run"
+RUN_RECORD = "org.copem_replay.run"
 """Our own record: what made the file."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's own record, and what in it counts the messages: no longer true of a copy with more of them."""
