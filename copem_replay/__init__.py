@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from copem_replay.cli.api.results import compare, load_results, view, write_report
     from copem_replay.cli.api.run import StudyResult, fused_tracks, observations, run
     from copem_replay.cli.api.study import load_experiment
+    from copem_replay.communication.link import LinkModel, SentLists
     from copem_replay.core.errors import (
         CopemError,
         EmptyWindowError,
@@ -37,25 +38,23 @@ if TYPE_CHECKING:
         OutputError,
         RecordingError,
     )
-    from copem_replay.core.fused_tracks import Belief as FusedTracks
-    from copem_replay.core.object_list import Lists as ObjectLists
-    from copem_replay.core.object_list import Reports as Inputs
-    from copem_replay.core.object_list import entries_of
+    from copem_replay.core.fused_tracks import FusedTracks
+    from copem_replay.core.object_list import Inputs, ObjectLists, entries_of
     from copem_replay.core.tracks import CLASSES, Scene, Tracks
-    from copem_replay.core.view_geometry import Errors
-    from copem_replay.core.view_geometry import Look as ViewGeometry
+    from copem_replay.core.view_geometry import Errors, ViewGeometry
     from copem_replay.experiment.schema import Configuration, Experiment, Unit
     from copem_replay.fusion.base import Inbox, ListFusion, StepFusion
-    from copem_replay.fusion.testing.check import RULES as FUSION_RULES
-    from copem_replay.fusion.testing.check import NonconformingError, check_fusion
+    from copem_replay.fusion.testing.check import FUSION_RULES, NonconformingError, check_fusion
     from copem_replay.io.recording import Recording
     from copem_replay.metrics.braking.driver import Driver, Reaction
     from copem_replay.metrics.config import Measure
     from copem_replay.metrics.gospa import gospa, ospa
+    from copem_replay.metrics.metric import RowMetric
     from copem_replay.metrics.onset import Onset
     from copem_replay.metrics.survival import cumulative_incidence
     from copem_replay.perception.pem.detection import DetectionModel
     from copem_replay.perception.pem.error import ErrorModel
+    from copem_replay.perception.visibility import VisibilityModel
     from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
 
@@ -76,6 +75,7 @@ __all__ = [
     "Inbox",
     "InputError",
     "Inputs",
+    "LinkModel",
     "ListFusion",
     "Measure",
     "NonconformingError",
@@ -86,12 +86,15 @@ __all__ = [
     "Recording",
     "RecordingError",
     "Results",
+    "RowMetric",
     "Scene",
+    "SentLists",
     "StepFusion",
     "StudyResult",
     "Tracks",
     "Unit",
     "ViewGeometry",
+    "VisibilityModel",
     "check_fusion",
     "compare",
     "cumulative_incidence",
@@ -119,31 +122,30 @@ _PLACES = {
     "cli.api.results": "compare load_results view write_report",
     "cli.api.run": "StudyResult fused_tracks observations run",
     "cli.api.study": "load_experiment",
+    "communication.link": "LinkModel SentLists",
     "core.errors": "CopemError EmptyWindowError ExperimentError InputError OutputError RecordingError",
-    "core.fused_tracks": "FusedTracks=Belief",
-    "core.object_list": "ObjectLists=Lists Inputs=Reports entries_of",
+    "core.fused_tracks": "FusedTracks",
+    "core.object_list": "Inputs ObjectLists entries_of",
     "core.tracks": "CLASSES Scene Tracks",
-    "core.view_geometry": "Errors ViewGeometry=Look",
+    "core.view_geometry": "Errors ViewGeometry",
     "experiment.schema": "Configuration Experiment Unit",
     "fusion.base": "Inbox ListFusion StepFusion",
-    "fusion.testing.check": "FUSION_RULES=RULES NonconformingError check_fusion",
+    "fusion.testing.check": "FUSION_RULES NonconformingError check_fusion",
     "io.recording": "Recording",
     "metrics.braking.driver": "Driver Reaction",
     "metrics.config": "Measure",
+    "metrics.metric": "RowMetric",
     "metrics.onset": "Onset",
     "metrics.gospa": "gospa ospa",
     "metrics.survival": "cumulative_incidence",
     "perception.pem.detection": "DetectionModel",
     "perception.pem.error": "ErrorModel",
+    "perception.visibility": "VisibilityModel",
     "results.compare": "Comparison",
     "results.read": "Results",
 }
-"""By module the names it gives; `public=private` where it has another one."""
-_MODULE = {
-    name: (f"{__name__}.{module}", own or name)
-    for module, names in _PLACES.items()
-    for name, _, own in (entry.partition("=") for entry in names.split())
-}
+"""By module the names it gives."""
+_MODULE = {name: f"{__name__}.{module}" for module, names in _PLACES.items() for name in names.split()}
 
 _cache_note()  # before Numba is imported
 _put_up_signposts()
@@ -154,10 +156,9 @@ if not TYPE_CHECKING:  # type checkers would take every name to be there
     def __getattr__(name: str) -> object:
         if name not in _MODULE:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module, own = _MODULE[name]
         if name == "plot":
-            return _importlib.import_module(f"{module}.{name}")
-        return getattr(_importlib.import_module(module), own)
+            return _importlib.import_module(f"{_MODULE[name]}.{name}")
+        return getattr(_importlib.import_module(_MODULE[name]), name)
 
 
 def __dir__() -> list[str]:

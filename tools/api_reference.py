@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import re
 import sys
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -95,14 +94,7 @@ def signature(function: Callable[..., object]) -> str:
         if one.name != "self":
             kind = "" if one.annotation is one.empty else f": {one.annotation}"
             parts.append(one.name + kind + ("" if one.default is one.empty else f" = {one.default!r}"))
-    return public(f"({', '.join(parts)}) -> {said.return_annotation}")
-
-
-def public(types: str) -> str:
-    """Types by the names that the API gives them."""
-    for name, (_, own) in cr._MODULE.items():
-        types = re.sub(rf"\b{own}\b", name, types) if own != name and own[0].isupper() else types
-    return types
+    return f"({', '.join(parts)}) -> {said.return_annotation}"
 
 
 def fields(kind: type) -> str:
@@ -114,7 +106,7 @@ def fields(kind: type) -> str:
         return ""
     said = [f"`{field.name}: {field.type}`" for field in dataclasses.fields(kind)]
     said += [f"`{name}`" for name, member in vars(kind).items() if is_property(member) and not name.startswith("_")]
-    return public(f"\n    Fields: {', '.join(said)}.")
+    return f"\n    Fields: {', '.join(said)}."
 
 
 def is_property(member: object) -> bool:
@@ -124,11 +116,10 @@ def is_property(member: object) -> bool:
 
 def constant_doc(name: str) -> str:
     """The text that stands below a constant in its module; empty: none."""
-    module, own = cr._MODULE[name]
-    body = ast.parse(inspect.getsource(sys.modules[module])).body
+    body = ast.parse(inspect.getsource(sys.modules[cr._MODULE[name]])).body
     for statement, after in pairwise(body):
         targets = [t.id for t in getattr(statement, "targets", ()) if isinstance(t, ast.Name)]
-        if own in targets and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+        if name in targets and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
             return str(after.value.value)
     return ""
 

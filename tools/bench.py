@@ -28,7 +28,7 @@ from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recording import read
 from copem_replay.perception.visibility import NO_STATICS, Flat, Observers, Surface, visible_shares
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 
 ROOT = Path(__file__).parents[1]
@@ -140,17 +140,17 @@ def writing() -> Iterator[dict[str, object]]:
     experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
     experiment = experiment.model_copy(update={"configurations": experiment.shown()})
     ready = prepare(recordings[0], experiment)
-    beliefs = believed(ready, experiment, 0)
+    run_tracks = tracks_of_run(ready, experiment, 0)
     table = replay_block(ready, experiment, np.arange(1))
     rates: dict[str, float | None] = dict.fromkeys(experiment.configurations)
     rows, _ = summary(table, list(experiment.configurations), rates, seed=1, horizon_s=horizon_s(table, None))
-    listed = sum(int(lists.fused.valid.sum()) for lists in beliefs.values())
+    listed = sum(int(lists.fused.valid.sum()) for lists in run_tracks.values())
     shown = listed + len(ready.truth.frame_ix)
     with _scratch() as folder:
         mcap, rrd = folder / "w.mcap", folder / "w.rrd"
-        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, [beliefs], table, {}), 1)
+        seconds = best(lambda: write_mcap(mcap, recordings[0].path, ready.scene, [run_tracks], table, {}), 1)
         yield {"mcap_objects_per_s": round(listed / seconds)}
-        seconds = best(lambda: write_rrd(rrd, ready, experiment, [beliefs], table, rows, 0), 3)
+        seconds = best(lambda: write_rrd(rrd, ready, experiment, [run_tracks], table, rows, 0), 3)
         yield {
             "rrd_boxes_per_s": round(shown / seconds),
             "rrd_bytes_per_box": round(rrd.stat().st_size / shown, 1),

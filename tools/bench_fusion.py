@@ -18,20 +18,20 @@ from pathlib import Path
 import numba as nb
 import numpy as np
 
-from copem_replay.communication.arrivals import instants
-from copem_replay.core.object_list import COVARIANCES, Lists, Reports, entries_of
+from copem_replay.communication.arrivals import fusion_schedule
+from copem_replay.core.object_list import COVARIANCES, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES, Float, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.ideal import fuse
-from copem_replay.fusion.inputs import reports
+from copem_replay.fusion.inputs import inputs
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.pipeline.blocks import blocks
 from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import World, _without_truth, listen, seen_by_all
+from copem_replay.pipeline.receiver import WorldChunk, _without_truth, listen, seen_by_all
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -47,7 +47,7 @@ _VAGUE_M2 = 1e6  # prior of a founding position: as good as none
 MISSING = {"why": "stonesoup is not installed: pip install '.[bench]'"}
 
 
-def scene(objects: int, units: int, count: int, seed: int = 0) -> tuple[Reports, Float]:
+def scene(objects: int, units: int, count: int, seed: int = 0) -> tuple[Inputs, Float]:
     """What `units` report in one run at `count` instants, at once; where the objects are (count, objects, 2)."""
     rng = np.random.default_rng(seed)
     place, speed = rng.uniform(0, 10 * math.sqrt(objects), (objects, 2)), rng.normal(0, 2, (objects, 2))
@@ -64,9 +64,9 @@ def scene(objects: int, units: int, count: int, seed: int = 0) -> tuple[Reports,
     entries["existence"], entries["captured_s"], entries["unit_ix"] = 0.9, now_s[instant], unit
     start = np.concatenate([[0], np.cumsum(seen.sum(axis=2))])[None]
     number, captured_s = np.arange(count * units), np.repeat(now_s, units)
-    told = Reports(
-        tuple(f"unit {u}" for u in range(units)), number % units, captured_s, captured_s, Lists(start, entries), now_s,
-        number.reshape(count, units), number, np.arange(count + 1) * units,
+    told = Inputs(
+        tuple(f"unit {u}" for u in range(units)), number % units, captured_s, captured_s, ObjectLists(start, entries),
+        now_s, number.reshape(count, units), number, np.arange(count + 1) * units,
     )  # fmt: skip
     return told, truth
 
@@ -99,14 +99,14 @@ def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterat
             }
 
 
-def _fusing(world: World, name: str, seen: Tracks, told: Lists) -> tuple[Callable[[], object], int]:
+def _fusing(world: WorldChunk, name: str, seen: Tracks, told: ObjectLists) -> tuple[Callable[[], object], int]:
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
     heard = listen(seen, world.truth, world.experiment, name)
     configuration = world.experiment.configurations[name]
     age_of_information_s, fusion = configuration.max_age_s, configuration.fusion
-    count = len(instants(heard, max_age_s=age_of_information_s).issue_s)
+    count = len(fusion_schedule(heard, max_age_s=age_of_information_s).issue_s)
     if isinstance(fusion, ListFusion):
-        ready = reports(heard, told, max_age_s=age_of_information_s)
+        ready = inputs(heard, told, max_age_s=age_of_information_s)
         return lambda: fusion.fuse(ready), count
     return lambda: fuse(heard, max_age_s=age_of_information_s, without_object_ix=world.scene.ego_ix), count
 
@@ -160,17 +160,17 @@ def gospa_vs_stonesoup(best: Best, pairs: int = 200) -> Iterator[Line]:
         return
     rng = np.random.default_rng(0)
     truth = rng.uniform(0, 10 * math.sqrt(15), (pairs, 15, 2))
-    believed = truth + rng.normal(size=truth.shape)
-    believed[:, 12:] = rng.uniform(0, 10 * math.sqrt(15), (pairs, 3, 2))  # three are missed, three are about nobody
+    output = truth + rng.normal(size=truth.shape)
+    output[:, 12:] = rng.uniform(0, 10 * math.sqrt(15), (pairs, 3, 2))  # three are missed, three are about nobody
     at = datetime(2000, 1, 1)
-    states = [[[State(point, timestamp=at) for point in points] for points in both] for both in (truth, believed)]
+    states = [[[State(point, timestamp=at) for point in points] for points in both] for both in (truth, output)]
     metric = GOSPAMetric(p=2, c=5)
 
     def theirs() -> list[float]:
         several = zip(*states, strict=True)
         return [metric.compute_gospa_metric(said, there)[0].value["distance"] for there, said in several]
 
-    columns = [np.ascontiguousarray(points.transpose(2, 0, 1)) for points in (truth, believed)]
+    columns = [np.ascontiguousarray(points.transpose(2, 0, 1)) for points in (truth, output)]
     off = float(np.abs(_gospas(*columns, 5.0, 2.0) - theirs()).max())
     assert off < 1e-9, f"{off} m apart"
     seconds = best(lambda: _gospas(*columns, 5.0, 2.0), 20)
@@ -183,15 +183,15 @@ def gospa_vs_stonesoup(best: Best, pairs: int = 200) -> Iterator[Line]:
 
 
 @nb.njit(cache=True, nogil=True)
-def _gospas(truth: Float, believed: Float, cutoff_m: float, power: float) -> Float:
+def _gospas(truth: Float, output: Float, cutoff_m: float, power: float) -> Float:
     """GOSPA (N,) of each of several pairs of lists, points (2, N, n)."""
     value_m, partner = np.empty(truth.shape[1]), np.empty(truth.shape[2], np.int64)
     alone = cutoff_m**power / 2
     for k in range(len(value_m)):
         cost, count = gospa_pairs(
-            truth[0, k], truth[1, k], believed[0, k], believed[1, k], cutoff_m, power, partner
+            truth[0, k], truth[1, k], output[0, k], output[1, k], cutoff_m, power, partner
         )  # fmt: skip
-        cost += alone * (truth.shape[2] + believed.shape[2] - 2 * count)
+        cost += alone * (truth.shape[2] + output.shape[2] - 2 * count)
         value_m[k] = cost ** (1 / power)
     return value_m
 
@@ -231,7 +231,7 @@ def tracker_vs_stonesoup(best: Best, scenes: int = 3, count: int = 6) -> Iterato
     yield line | {key: round(float(value), 2) for key, value in zip(keys, np.mean(said, axis=0), strict=True)}
 
 
-def _stonesoup(told: Reports) -> Callable[[], Float]:
+def _stonesoup(told: Inputs) -> Callable[[], Float]:
     """Feeds Stone Soup's tracker all lists, made before, in order: where its tracks (n, 2) are in the end."""
     from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
     from stonesoup.deleter.time import UpdateTimeDeleter

@@ -100,7 +100,7 @@ class Scenario:
     def rates(self, fitted: Parameters, latest_s: np.ndarray) -> dict[str, float]:
         """Exact success rate of each configuration."""
         until_s = np.interp(-1 / fitted.a_max_mps2, -1 / np.array(DECELERATIONS_MPS2), latest_s)
-        between_s = np.array([[float(self.replay.looks.onset_s[0]), until_s]])
+        between_s = np.array([[float(self.replay.episodes.onset_s[0]), until_s]])
         reaction = GammaReaction(shape=fitted.shape, mean_s=fitted.mean_s)
         return {
             name: float(of.probability @ pass_probability(between_s, of.time_s, reaction))

@@ -39,11 +39,11 @@ class Design:
 
 
 def _beta(a: float, b: float) -> Draw:
-    return lambda dice, clusters: dice.beta(a, b, clusters)
+    return lambda rng, clusters: rng.beta(a, b, clusters)
 
 
 def _all_or_nothing(share: float) -> Draw:
-    return lambda dice, clusters: (dice.random(clusters) < share).astype(float)
+    return lambda rng, clusters: (rng.random(clusters) < share).astype(float)
 
 
 DESIGNS: Final = (
@@ -53,19 +53,19 @@ DESIGNS: Final = (
     *(Design(f"0/1 at {share:g}", share, _all_or_nothing(share)) for share in (0.5, 0.9, 0.97)),
 )
 WEIGHTS: Final[dict[str, Draw]] = {
-    "equal": lambda dice, clusters: np.ones(clusters),
-    "lognormal": lambda dice, clusters: dice.lognormal(0.0, 1.0, clusters),
+    "equal": lambda rng, clusters: np.ones(clusters),
+    "lognormal": lambda rng, clusters: rng.lognormal(0.0, 1.0, clusters),
 }
 
 
 def held(design: Design, weights: str, clusters: int, trials: int, seed: int) -> dict[str, object]:
     """How many of the trials' intervals hold the true share, and their mean width."""
-    dice = np.random.default_rng([seed, clusters, *design.name.encode(), *weights.encode()])
+    rng = np.random.default_rng([seed, clusters, *design.name.encode(), *weights.encode()])
     resampled = resamples([str(k) for k in range(clusters)], seed)
     limits = np.empty((trials, 2, 2))
     for trial in range(trials):
-        totals = WEIGHTS[weights](dice, clusters)
-        successes = np.minimum(totals * design.draw(dice, clusters), totals)
+        totals = WEIGHTS[weights](rng, clusters)
+        successes = np.minimum(totals * design.draw(rng, clusters), totals)
         limits[trial, 0] = bootstrap_share(successes, totals, resampled)
         limits[trial, 1] = share_limits(successes, totals, resampled)[1:]
     # Sums of ones over sums of ones are 1 but for rounding.

@@ -112,7 +112,7 @@ class Trial:
         paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
         return {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
 
-    def look(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
+    def episode(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
         """What a killed run left: it is that of one of two seeds (None: there was nothing)."""
         found.leftovers += len(os.listdir(self.out.parent)) > self.out.exists() if self.out.parent.exists() else 0
         before, seed = seeds
@@ -169,7 +169,7 @@ def kill(
 ) -> Found:
     """Kill so many runs: half at steps spread over all there are, half after random times; every tenth a first run."""
     warmed(experiment)
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     trial, found = Trial(here, experiment, two_steps=two_steps), Found()
     for number in (1, 2):
         trial.run(number)
@@ -180,9 +180,9 @@ def kill(
     takes_s = time.perf_counter() - begin
     steps = trial.steps(2)
     ends = [k * steps // (kills // 2) for k in range(kills // 2 + 1)]
-    counted = [dice.randrange(low, max(high, low + 1)) for low, high in pairwise(ends)]
-    moments: list[int | float] = [*counted, *(dice.uniform(0, takes_s) for _ in range(kills - len(counted)))]
-    dice.shuffle(moments)
+    counted = [rng.randrange(low, max(high, low + 1)) for low, high in pairwise(ends)]
+    moments: list[int | float] = [*counted, *(rng.uniform(0, takes_s) for _ in range(kills - len(counted)))]
+    rng.shuffle(moments)
     there: int | None = 2
     for k, moment in enumerate(moments):
         if k % 10 == 9:
@@ -200,7 +200,7 @@ def kill(
             os.kill(child, signal.SIGKILL)
         found.kills += 1
         found.unscathed += ended(child) is not None
-        trial.look((there, new), found, what)
+        trial.view((there, new), found, what)
         trial.look_again((there, new), found, what)
         (trial.out / _NOTE).write_text("mine\n")
         there = new

@@ -17,7 +17,7 @@ _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
-class Instants:
+class FusionSchedule:
     """Instants (K,), and the newest list of each unit at each: frame index (K, U), −1: none.
 
     `arrived (A,)` are the lists in order of arrival, `arrived[arrived_start[k] : arrived_start[k + 1]]` those of
@@ -29,11 +29,11 @@ class Instants:
     arrived: Int
     arrived_start: Int
 
-    def between(self, from_s: float, until_s: float) -> Instants:
+    def between(self, from_s: float, until_s: float) -> FusionSchedule:
         """Those from one time on and before another."""
         first, after = np.searchsorted(self.issue_s, (from_s, until_s))
         begin, end = self.arrived_start[first], self.arrived_start[after]
-        return Instants(
+        return FusionSchedule(
             self.issue_s[first:after],
             self.newest[first:after],
             self.arrived[begin:end],
@@ -41,7 +41,7 @@ class Instants:
         )
 
 
-def instants(heard: Tracks, *, max_age_s: float) -> Instants:
+def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
     """The receiver's instants for lists whose arrival times are common to all runs."""
     arrives_s = heard.arrives_s[0]
     arrived = np.flatnonzero(np.isfinite(arrives_s))
@@ -51,7 +51,7 @@ def instants(heard: Tracks, *, max_age_s: float) -> Instants:
     last = np.append(np.diff(ordered) > _TOLERANCE_S, True) if len(ordered) else np.empty(0, dtype=bool)
     issue_s = ordered[last]
     newest = np.full((len(issue_s), max(len(heard.units), 1)), -1)
-    superseded = outrun(heard)
+    superseded = out_of_sequence(heard)
     for unit in range(len(heard.units)):
         mine = arrived[(heard.frame_unit_ix[arrived] == unit) & ~superseded[arrived]]
         at = np.searchsorted(arrives_s[mine], issue_s + _TOLERANCE_S, side="right") - 1
@@ -59,10 +59,10 @@ def instants(heard: Tracks, *, max_age_s: float) -> Instants:
         frame = mine[at[known]]
         fresh = issue_s[known] <= arrives_s[frame] + max_age_s + _TOLERANCE_S
         newest[np.flatnonzero(known)[fresh], unit] = frame[fresh]
-    return Instants(issue_s, newest, arrived, np.append(0, np.flatnonzero(last) + 1))
+    return FusionSchedule(issue_s, newest, arrived, np.append(0, np.flatnonzero(last) + 1))
 
 
-def outrun(heard: Tracks) -> Bool:
+def out_of_sequence(heard: Tracks) -> Bool:
     """(F,) lists that arrive when a newer one of their unit is there already, or not at all."""
     arrives_s = heard.arrives_s[0]
     result: Bool = ~np.isfinite(arrives_s)

@@ -18,7 +18,11 @@ from copem_replay.core.tracks import Float, Int, Tracks
 
 @dataclass(frozen=True)
 class SentLists:
-    """The lists (F,) of some units (U,) as they are sent. Times are seconds since the log's start."""
+    """The lists (F,) of some units (U,) as they are sent. Times are seconds since the log's start.
+
+    >>> cr.SentLists(("rsu",), np.zeros(1, dtype=int), captured_s=np.array([0.1]), sent_s=np.array([0.1])).units
+    ('rsu',)
+    """
 
     units: tuple[str, ...]  # U names; the truth has the one unit TRUTH
     unit_ix: Int  # (F,) the unit that sends each list
@@ -27,7 +31,12 @@ class SentLists:
 
 
 class LinkModel(Component, ABC):
-    """Base of all links, of a configuration's `link:`. A link is pure: the same lists have the same delays."""
+    """Base of all links, of a configuration's `link:`. A link is pure: the same lists have the same delays.
+
+    >>> class Filling(cr.LinkModel):
+    ...     def delays_s(self, lists):
+    ...         return (0.01 * lists.sent_s)[None]
+    """
 
     @abstractmethod
     def delays_s(self, lists: SentLists) -> Float:

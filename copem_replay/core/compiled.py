@@ -1,6 +1,9 @@
 """Where compiled code is cached: by Numba beside the source or in the user's cache, else in a folder of the user's own
 under the system's temporary one.
 
+An index in a cache names the classes of arguments. Numba reads it before it compares it with the source, so that one
+which names a class that has gone fails: indices older than their source are removed first.
+
 What is in a cache is run. So that folder has to be the user's, with no rights of others, and no link; where another is
 in its place, one of this process alone is made.
 """
@@ -26,7 +29,9 @@ def cache_note() -> str | None:
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
     """Have a place for compiled code, before Numba is imported. Returns what has to be said of it: None, nothing."""
-    if _writable(environment.get(VARIABLE)) or all(_writable(f"{folder}/__pycache__") for folder in _folders(package)):
+    folders = _folders(package)
+    _remove_stale(folders)
+    if _writable(environment.get(VARIABLE)) or all(_writable(f"{folder}/__pycache__") for folder in folders):
         return None
     home = environment.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     if _writable(f"{home}/numba"):
@@ -45,6 +50,18 @@ def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) ->
 def _folders(package: Path) -> list[str]:
     """The package, and all packages in it."""
     return [folder for folder, _, files in os.walk(package) if "__init__.py" in files]
+
+
+def _remove_stale(folders: list[str]) -> None:
+    """Remove indices of compiled code that are older than the module they are of (`module.function-line.py311.nbi`)."""
+    for folder in folders:
+        with suppress(OSError), os.scandir(f"{folder}/__pycache__") as files:
+            for index in files:
+                if index.name.endswith(".nbi"):
+                    with suppress(OSError):
+                        source = os.stat(f"{folder}/{index.name.partition('.')[0]}.py")
+                        if index.stat().st_mtime_ns < source.st_mtime_ns:
+                            os.remove(index.path)
 
 
 def _writable(folder: str | None) -> bool:

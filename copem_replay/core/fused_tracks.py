@@ -1,4 +1,4 @@
-"""What the receiver believes in one run or several, as tracks: for writing, for showing, and for what they imply."""
+"""The receiver's fused tracks in one run or several: for writing, for showing, and for what they imply."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 from copem_replay.core.agree import most_probable_of_each
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 
 if TYPE_CHECKING:  # it takes long to import
     import pandas as pd
 
 
 @dataclass(frozen=True)
-class Belief:
+class FusedTracks:
     """The fused lists as tracks, and the entries of the units' lists that each fused row (P,) is made of.
 
     Fusions without truth ids give the rows alone: `said` (P,) then holds the entries of the fusion, in one run, and
@@ -34,7 +34,7 @@ class Belief:
     heard: Tracks
     entries: Int  # (C,) rows of `heard`, those that were not detected too
     start: Int  # (P + 1,) where the entries of each fused row begin
-    look: Look | None = None  # how the rows of `heard` look from their units; the truth needs none
+    view: ViewGeometry | None = None  # how the rows of `heard` look from their units; the truth needs none
     said: Entries | None = None
     scene: Scene | None = None  # of the log, where rows are to be named
 

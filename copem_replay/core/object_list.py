@@ -64,7 +64,7 @@ def entries_of(count: int) -> Entries:
 
 
 @dataclass(frozen=True)
-class Lists:
+class ObjectLists:
     """Lists of S runs: list k of run s is `entries[start[s, k] : start[s, k + 1]]`, in no order that means anything.
 
     `start (S, K + 1)`, `entries (N,)`.
@@ -84,7 +84,7 @@ class Lists:
 
 
 @dataclass(frozen=True)
-class Reports:
+class Inputs:
     """All lists of all units, when the receiver has each, and the instants at which it issues a fused list.
 
     List f is the same capture of the same unit in all runs; what is in it differs from run to run. Entries of one list
@@ -102,7 +102,7 @@ class Reports:
     unit_ix: Int  # (F,) whose list
     captured_s: Float  # (F,)
     arrives_s: Float  # (F,) inf: never
-    lists: Lists  # of the units: F lists in each of S runs
+    lists: ObjectLists  # of the units: F lists in each of S runs
     issue_s: Float  # (K,) ascending
     newest: Int  # (K, U) each unit's newest list that has arrived and is not too old; −1: none
     arrived: Int  # (A,) lists in order of arrival; lists that never arrive are not among them

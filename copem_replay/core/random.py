@@ -27,7 +27,7 @@ from copem_replay.core.tracks import Bool, Float, Int
 Words = NDArray[np.uint64]
 
 
-@lru_cache(2**16, typed=True)  # of the same few units and objects, stretch after stretch
+@lru_cache(2**16, typed=True)  # of the same few units and objects, chunk after chunk
 def stable_hash(*parts: str | int) -> int:
     """A 64-bit hash that is the same on every machine and in every process."""
     return int.from_bytes(blake2b(json.dumps(parts).encode(), digest_size=8).digest(), "little")
@@ -39,7 +39,7 @@ def object_words(object_ids: Sequence[str]) -> Words:
 
 
 @dataclass(frozen=True)
-class Address:
+class RandomKey:
     """Who the numbers are for, row by row: one number per run and row.
 
     `units` are the U names, `unit_ix (P,)` says whose row it is; `object_word (P,)` comes from `object_words`.
@@ -50,41 +50,41 @@ class Address:
     object_word: Words
     stamp_ns: Int
 
-    def take(self, rows: Int) -> Address:
+    def take(self, rows: Int) -> RandomKey:
         """The same for some rows only: their numbers do not change."""
-        return Address(self.units, self.unit_ix[rows], self.object_word[rows], self.stamp_ns[rows])
+        return RandomKey(self.units, self.unit_ix[rows], self.object_word[rows], self.stamp_ns[rows])
 
 
 @dataclass(frozen=True)
-class Dice:
+class CounterRng:
     """The dice of one log under one seed. Two logs never share theirs: the log's name is part of the address."""
 
     seed: int
     log: str
 
-    def uniform(self, purpose: str, address: Address, runs: Int) -> Float:
+    def uniform(self, purpose: str, random_key: RandomKey, runs: Int) -> Float:
         """(S, P) uniform in (0, 1), ends excluded, for runs (S,)."""
-        out = np.empty((len(runs), len(address.stamp_ns)))
-        _uniform(*self._words(purpose, address, runs), out)
+        out = np.empty((len(runs), len(random_key.stamp_ns)))
+        _uniform(*self._words(purpose, random_key, runs), out)
         return out
 
-    def bernoulli(self, purpose: str, address: Address, runs: Int, probability: Float) -> Bool:
+    def bernoulli(self, purpose: str, random_key: RandomKey, runs: Int, probability: Float) -> Bool:
         """(S, P) True with `probability (P,)`: the addressed uniform is below it (0: never, 1: always)."""
-        out = np.empty((len(runs), len(address.stamp_ns)), dtype=np.bool_)
-        _bernoulli(*self._words(purpose, address, runs), np.ascontiguousarray(probability), out)
+        out = np.empty((len(runs), len(random_key.stamp_ns)), dtype=np.bool_)
+        _bernoulli(*self._words(purpose, random_key, runs), np.ascontiguousarray(probability), out)
         return out
 
-    def normal(self, purpose: str, address: Address, runs: Int, where: Bool | None = None) -> Float:
+    def normal(self, purpose: str, random_key: RandomKey, runs: Int, where: Bool | None = None) -> Float:
         """(S, P) standard normal; 0 where `where (S, P)` is False, which costs nothing."""
-        out = np.zeros((len(runs), len(address.stamp_ns)))
+        out = np.zeros((len(runs), len(random_key.stamp_ns)))
         mask = np.ones((1, 1), dtype=np.bool_) if where is None else where
-        _normal(*self._words(purpose, address, runs), mask, out)
+        _normal(*self._words(purpose, random_key, runs), mask, out)
         return out
 
-    def _words(self, purpose: str, address: Address, runs: Int) -> tuple[Words, Words, Words, Words]:
-        keys = [stable_hash(self.seed, self.log, purpose, unit) for unit in address.units]
-        key = np.array(keys, dtype=np.uint64)[address.unit_ix]
-        return key, address.object_word, address.stamp_ns.astype(np.uint64), runs.astype(np.uint64)
+    def _words(self, purpose: str, random_key: RandomKey, runs: Int) -> tuple[Words, Words, Words, Words]:
+        keys = [stable_hash(self.seed, self.log, purpose, unit) for unit in random_key.units]
+        key = np.array(keys, dtype=np.uint64)[random_key.unit_ix]
+        return key, random_key.object_word, random_key.stamp_ns.astype(np.uint64), runs.astype(np.uint64)
 
 
 _LOW = np.uint64(0xFFFFFFFF)

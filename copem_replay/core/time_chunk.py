@@ -8,11 +8,11 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Stretch:
+class TimeChunk:
     """Instants from `from_s` on and before `until_s`, in seconds of the log."""
 
     from_s: float = -np.inf
     until_s: float = np.inf
 
 
-WHOLE = Stretch()
+WHOLE = TimeChunk()

@@ -15,7 +15,7 @@ Noise = Callable[[str], Float]
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewGeometry:
     """The view of each candidate row from its unit. All (P,); nothing here depends on the run.
 
     `observations` gives the same as a table.
@@ -36,9 +36,9 @@ class Look:
     yaw_rad: Float
     speed_mps: Float
 
-    def take(self, rows: Int) -> Look:
-        """The look of some rows."""
-        return Look(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+    def take(self, rows: Int) -> ViewGeometry:
+        """The view geometry of some rows."""
+        return ViewGeometry(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 @dataclass(frozen=True)

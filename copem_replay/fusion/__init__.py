@@ -1,4 +1,4 @@
-"""Fusion: what the receiver believes, from the lists that have arrived (f of the paper's coPEM)."""
+"""Fusion: the receiver's tracks, from the lists that have arrived (f of the paper's coPEM)."""
 
 FUSIONS = {
     "ideal": "copem_replay.fusion.base:Ideal",

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.components import Component, GivenError, asked, wrong
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports, TellsOf
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, TellsOf
 from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
@@ -43,7 +43,7 @@ class ListFusion(Fusion):
     """
 
     resumable: ClassVar[bool] = False
-    """Whether `resume` gives, stretch after stretch of the instants, the very lists of `fuse`; if not, all instants are
+    """Whether `resume` gives, chunk after chunk of the instants, the very lists of `fuse`; if not, all instants are
     handed over at once. Whoever overrides `fuse` has to say so anew."""
 
     tells_of: ClassVar[TellsOf] = "capture"
@@ -66,15 +66,15 @@ class ListFusion(Fusion):
 
     @property
     def looks_back_s(self) -> float:
-        """Which lists that arrived before a stretch it needs once more, beside those in `newest`.
+        """Which lists that arrived before a time chunk it needs once more, beside those in `newest`.
 
         Those captured at most so long before the newest capture that had arrived by then: the others have no entries.
-        It is from that capture that it counts, not from the stretch's first instant, since all lists may come late.
+        It is from that capture that it counts, not from the time chunk's first instant, since all lists may come late.
         """
         return 0.0
 
     @abstractmethod
-    def fuse(self, reports: Reports) -> Lists:
+    def fuse(self, inputs: Inputs) -> ObjectLists:
         """One fused list per instant and run, `start (S, K + 1)`.
 
         The list of instant k may depend on nothing that arrives later, nor on other runs, nor on the order of
@@ -83,14 +83,14 @@ class ListFusion(Fusion):
         keeps none).
         """
 
-    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
-        """The lists of the next stretch of instants, and what is to be remembered for the one after it.
+    def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
+        """The lists of the next time chunk of instants, and what is to be remembered for the one after it.
 
-        Stretches are consecutive, and lists of units have the same numbers in all. `memory`: what the last call gave,
+        Time chunks are consecutive, and lists of units have the same numbers in all. `memory`: what the last call gave,
         None at first; each is handed over once. As it stands here a fusion without memory is resumed: the list of an
         instant depends on the lists in `newest` and `arrived` alone.
         """
-        return self.fuse(reports), None
+        return self.fuse(inputs), None
 
 
 @dataclass(frozen=True)
@@ -134,13 +134,13 @@ class StepFusion(ListFusion):
     def step(self, now_s: float, inbox: Inbox, memory: Any) -> tuple[Entries, Any]:
         """The fused list of this instant, and what is to be remembered until the next (`memory`: None at first)."""
 
-    def fuse(self, reports: Reports) -> Lists:
+    def fuse(self, inputs: Inputs) -> ObjectLists:
         """Every run by itself, instant after instant."""
-        return self.resume(reports, None)[0]
+        return self.resume(inputs, None)[0]
 
-    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+    def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
         """The same at the next instants. What is remembered is of each run what its last step gave."""
-        runs, instants = len(reports.lists.start), len(reports.issue_s)
+        runs, instants = len(inputs.lists.start), len(inputs.issue_s)
         start = np.zeros((runs, instants + 1), dtype=np.int64)
         parts: list[Entries] = []
         total = 0
@@ -148,7 +148,7 @@ class StepFusion(ListFusion):
         for s in range(runs):
             start[s, 0] = total
             for k in range(instants):
-                given = self.step(float(reports.issue_s[k]), inbox_at(reports, s, k), memories[s])
+                given = self.step(float(inputs.issue_s[k]), inbox_at(inputs, s, k), memories[s])
                 if not isinstance(given, tuple) or len(given) != 2:
                     raise GivenError("step", f"expected a list and a memory, found {type(given).__name__}")
                 entries, memories[s] = given
@@ -158,25 +158,25 @@ class StepFusion(ListFusion):
                 parts.append(entries)
                 total += len(entries)
                 start[s, k + 1] = total
-        return Lists(start, np.concatenate([reports.lists.entries[:0], *parts])), memories
+        return ObjectLists(start, np.concatenate([inputs.lists.entries[:0], *parts])), memories
 
 
-def fused_by(fusion: ListFusion, reports: Reports, where: str) -> Lists:
+def fused_by(fusion: ListFusion, inputs: Inputs, where: str) -> ObjectLists:
     """What a fusion gives, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
-    return _checked(asked(fusion, where, lambda: fusion.fuse(reports)), fusion, reports, where)
+    return _checked(asked(fusion, where, lambda: fusion.fuse(inputs)), fusion, inputs, where)
 
 
-def resumed_by(fusion: ListFusion, reports: Reports, memory: Any, where: str) -> tuple[Lists, Any]:
-    """What a `resumable` fusion gives of the next stretch and remembers, checked as `fused_by` does."""
-    given = asked(fusion, where, lambda: fusion.resume(reports, memory))
+def resumed_by(fusion: ListFusion, inputs: Inputs, memory: Any, where: str) -> tuple[ObjectLists, Any]:
+    """What a `resumable` fusion gives of the next time chunk and remembers, checked as `fused_by` does."""
+    given = asked(fusion, where, lambda: fusion.resume(inputs, memory))
     if said := pair_problem(given):
         raise wrong(fusion, where, said, "resume")
     found, memory = given
-    return _checked(found, fusion, reports, where), memory
+    return _checked(found, fusion, inputs, where), memory
 
 
-def _checked(found: Lists, fusion: ListFusion, reports: Reports, where: str) -> Lists:
-    said = form_problem(found, reports) or content_problem(found, reports)
+def _checked(found: ObjectLists, fusion: ListFusion, inputs: Inputs, where: str) -> ObjectLists:
+    said = form_problem(found, inputs) or content_problem(found, inputs)
     if said is not None:
         raise wrong(fusion, where, said, "step", "fuse", "resume")
     return found
@@ -186,13 +186,13 @@ def pair_problem(given: object) -> str | None:
     """What is wrong with the form of what `resume` gave; None: it is two things."""
     if isinstance(given, tuple) and len(given) == 2:
         return None
-    return f"resume: expected Lists and a memory, found {type(given).__name__}"
+    return f"resume: expected ObjectLists and a memory, found {type(given).__name__}"
 
 
-def form_problem(found: object, reports: Reports) -> str | None:
+def form_problem(found: object, inputs: Inputs) -> str | None:
     """What is wrong with the form of the lists a fusion gave; None: nothing."""
-    shape = (len(reports.lists.start), len(reports.issue_s) + 1)
-    if not isinstance(found, Lists):
+    shape = (len(inputs.lists.start), len(inputs.issue_s) + 1)
+    if not isinstance(found, ObjectLists):
         return f"fuse: expected Lists, found {type(found).__name__}"
     if found.start.shape != shape or found.entries.dtype != ENTRY:
         return (
@@ -206,7 +206,7 @@ def form_problem(found: object, reports: Reports) -> str | None:
     return None
 
 
-def content_problem(found: Lists, reports: Reports) -> str | None:
+def content_problem(found: ObjectLists, inputs: Inputs) -> str | None:
     """What is wrong with the entries of lists of the right form; None: nothing."""
     for name in (*VALUES, *COVARIANCES, "existence", "captured_s", "class_probability"):
         if not np.isfinite(found.entries[name]).all():
@@ -217,7 +217,7 @@ def content_problem(found: Lists, reports: Reports) -> str | None:
     ee, en, nn = (found.entries[name] for name in COVARIANCES)
     if ((ee <= 0) | (nn <= 0) | (ee * nn - en * en <= 0)).any():
         return "cov_*_m2: expected positive definite covariances"
-    if not (had := _had(found, reports)).all():
+    if not (had := _had(found, inputs)).all():
         wrong = float(found.entries["captured_s"][np.argmin(had)])
         return f"captured_s: expected the capture of a list that has arrived, found {wrong:.9g} s"
     tracked = found.entries["track_id"] >= 0
@@ -227,19 +227,19 @@ def content_problem(found: Lists, reports: Reports) -> str | None:
     if (twice & (np.diff(found.entries["track_id"][tracked][order]) == 0)).any():
         return "track_id: expected each once in a list, found one twice (−1: no track is kept)"
     unit_ix = found.entries["unit_ix"]
-    if ((unit_ix < -1) | (unit_ix >= len(reports.units))).any():
-        return f"unit_ix: expected −1 … {len(reports.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"
+    if ((unit_ix < -1) | (unit_ix >= len(inputs.units))).any():
+        return f"unit_ix: expected −1 … {len(inputs.units) - 1}, found {unit_ix.min()} … {unit_ix.max()}"
     return None
 
 
-def _had(found: Lists, reports: Reports) -> Bool:
+def _had(found: ObjectLists, inputs: Inputs) -> Bool:
     """(N,) whether a list that was captured when an entry says so has arrived when the entry's list is issued."""
-    captured_s, which = np.unique(reports.captured_s, return_inverse=True)
+    captured_s, which = np.unique(inputs.captured_s, return_inverse=True)
     first_s = np.full(len(captured_s), np.inf)
-    np.minimum.at(first_s, which, reports.arrives_s)
+    np.minimum.at(first_s, which, inputs.arrives_s)
     had: Bool = np.zeros(len(found.entries), dtype=bool)
     if len(captured_s):
-        _find_had(found.start, found.entries["captured_s"], reports.issue_s, captured_s, first_s, _TOLERANCE_S, had)
+        _find_had(found.start, found.entries["captured_s"], inputs.issue_s, captured_s, first_s, _TOLERANCE_S, had)
     return had
 
 
@@ -262,16 +262,16 @@ def _find_had(
                 f = min(f, len(captured_s) - 1)
 
 
-def inbox_at(reports: Reports, run: int, instant: int) -> Inbox:
+def inbox_at(inputs: Inputs, run: int, instant: int) -> Inbox:
     """What the receiver has at one instant of one run."""
 
     def one(f: int) -> UnitList:
-        entries = reports.lists.of(run, f).copy()  # whoever changes it changes his own
+        entries = inputs.lists.of(run, f).copy()  # whoever changes it changes his own
         return UnitList(
-            reports.units[reports.unit_ix[f]], float(reports.captured_s[f]), float(reports.arrives_s[f]), entries
+            inputs.units[inputs.unit_ix[f]], float(inputs.captured_s[f]), float(inputs.arrives_s[f]), entries
         )
 
-    newest = [int(f) for f in reports.newest[instant] if f >= 0]
-    came = reports.arrived[reports.arrived_start[instant] : reports.arrived_start[instant + 1]]
-    in_order = came[np.lexsort((reports.unit_ix[came], reports.captured_s[came]))]
+    newest = [int(f) for f in inputs.newest[instant] if f >= 0]
+    came = inputs.arrived[inputs.arrived_start[instant] : inputs.arrived_start[instant + 1]]
+    in_order = came[np.lexsort((inputs.unit_ix[came], inputs.captured_s[came]))]
     return Inbox(tuple(map(one, newest)), tuple(one(int(f)) for f in in_order))

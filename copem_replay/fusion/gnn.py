@@ -10,7 +10,7 @@ from pydantic import Field
 
 from copem_replay.core.agree import AGREE
 from copem_replay.core.components import Share
-from copem_replay.core.object_list import ENTRY, Entries, Lists, Reports
+from copem_replay.core.object_list import ENTRY, Entries, Inputs, ObjectLists
 from copem_replay.core.tracks import Float
 from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.gnn_kernel import fuse_run, intersect
@@ -43,21 +43,21 @@ class Gnn(ListFusion):
 
     resumable: ClassVar[bool] = True
 
-    def fuse(self, reports: Reports) -> Lists:
+    def fuse(self, inputs: Inputs) -> ObjectLists:
         """Every run by itself."""
         runs = []
         informed = self.combine == "inverse_variance"
-        for bounds in reports.lists.start:
-            entries = reports.lists.entries[bounds[0] : bounds[-1]]
+        for bounds in inputs.lists.start:
+            entries = inputs.lists.entries[bounds[0] : bounds[-1]]
             clusters, fused = fuse_run(
-                entries, numbers(entries), bounds - bounds[0], reports.captured_s, reports.arrives_s, reports.newest,
+                entries, numbers(entries), bounds - bounds[0], inputs.captured_s, inputs.arrives_s, inputs.newest,
                 AGREE, -2 * math.log1p(-self.gate), informed, self.min_existence,
             )  # fmt: skip
             if not informed:
                 fast = self.combine == "fast_covariance_intersection"
                 intersect(clusters, self.minimise == "determinant", fast, fused)
             runs.append((clusters.start, fused))
-        return run_after_run(runs, len(reports.issue_s))
+        return run_after_run(runs, len(inputs.issue_s))
 
 
 def numbers(entries: Entries) -> Float:

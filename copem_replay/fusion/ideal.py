@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.communication.arrivals import Instants, instants
-from copem_replay.core.fused_tracks import Belief
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.covariance import FLATTEST
 
@@ -23,14 +23,16 @@ SMALLEST_VARIANCE = 1e-9
 """A variance below this counts as this in weights (m², rad², m²/s²; the contract's)."""
 
 
-def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1, at: Instants | None = None) -> Belief:
+def fuse(
+    heard: Tracks, *, max_age_s: float, without_object_ix: int = -1, at: FusionSchedule | None = None
+) -> FusedTracks:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`. `at`: some of the instants.
 
     `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
     `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
     """
-    at = at or instants(heard, max_age_s=max_age_s)
+    at = at or fusion_schedule(heard, max_age_s=max_age_s)
     rows, start, object_ix, instant = _contributions(heard, at.newest, without_object_ix)
     valid = _any(heard.valid, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
@@ -64,18 +66,18 @@ def fuse(heard: Tracks, *, max_age_s: float, without_object_ix: int = -1, at: In
         speed_var_m2ps2=spread["speed_var_m2ps2"],
         **out,
     )
-    return Belief(fused, heard, rows, start)
+    return FusedTracks(fused, heard, rows, start)
 
 
-def draw_posterior(belief: Belief, scene: Scene, seed: int, runs: Int) -> Belief:
+def draw_posterior(fused_tracks: FusedTracks, scene: Scene, seed: int, runs: Int) -> FusedTracks:
     """One draw of ε ~ N(μ, Σ) per object and list, around the fused expected states (S, P)."""
-    expected = belief.fused
+    expected = fused_tracks.fused
     words = object_words(scene.object_ids)[expected.row_object_ix]
     zero = np.zeros(len(words), dtype=np.int64)
-    address = Address(("",), zero, words, expected.stamp_ns[expected.frame_ix])
-    dice = Dice(seed, scene.log)
-    z1 = dice.normal("ideal fusion 1", address, runs, expected.valid)
-    z2 = dice.normal("ideal fusion 2", address, runs, expected.valid)
+    random_key = RandomKey(("",), zero, words, expected.stamp_ns[expected.frame_ix])
+    rng = CounterRng(seed, scene.log)
+    z1 = rng.normal("ideal fusion 1", random_key, runs, expected.valid)
+    z2 = rng.normal("ideal fusion 2", random_key, runs, expected.valid)
     assert expected.cov_ee_m2 is not None
     assert expected.cov_en_m2 is not None
     assert expected.cov_nn_m2 is not None
@@ -83,7 +85,7 @@ def draw_posterior(belief: Belief, scene: Scene, seed: int, runs: Int) -> Belief
     l21 = expected.cov_en_m2 / l11
     l22 = np.sqrt(np.maximum(expected.cov_nn_m2 - l21**2, 0.0))
     drawn = replace(expected, x_m=expected.x_m + l11 * z1, y_m=expected.y_m + l21 * z1 + l22 * z2)
-    return replace(belief, fused=drawn)
+    return replace(fused_tracks, fused=drawn)
 
 
 def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[Int, Int, Int, Int]:

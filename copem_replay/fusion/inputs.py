@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from copem_replay.communication.arrivals import Instants, instants
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Lists, Reports
+from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists
 from copem_replay.core.tracks import VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floored
 
@@ -26,13 +26,13 @@ class Claims:
     track_id: Int
 
 
-def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> Lists:
+def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
     """The lists of all units in all runs, F in each of S. `drawn (S, P)`: by what entries of a list are ordered."""
     kept = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
     return gathered(heard, claims, drawn, kept)[0]
 
 
-def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[Lists, Int, Int]:
+def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[ObjectLists, Int, Int]:
     """Rows of `valid (S, P)` as lists, ordered by `drawn (S, P)`; and of which run and row each entry is, (N,) each."""
     order, bounds = heard.by_frame
     start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
@@ -49,16 +49,16 @@ def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[
     for name, values in zip(COVARIANCES, (ee, en, nn), strict=True):
         if len(values) > 1:
             entries[name] = values[run, picked]
-    return Lists(start, entries), run, picked
+    return ObjectLists(start, entries), run, picked
 
 
-def reports(heard: Tracks, lists: Lists, *, max_age_s: float, at: Instants | None = None) -> Reports:
+def inputs(heard: Tracks, lists: ObjectLists, *, max_age_s: float, at: FusionSchedule | None = None) -> Inputs:
     """The same lists as one configuration's receiver has them: when each arrives, and which it goes by when.
 
     `at`: some of the instants.
     """
-    at = at or instants(heard, max_age_s=max_age_s)
-    return Reports(
+    at = at or fusion_schedule(heard, max_age_s=max_age_s)
+    return Inputs(
         heard.units, heard.frame_unit_ix, heard.captured_s, heard.arrives_s[0], lists,
         at.issue_s, at.newest, at.arrived, at.arrived_start,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from copem_replay.core.agree import AGREE, most_probable_of_each
 from copem_replay.core.components import Positive, Share
-from copem_replay.core.object_list import Entries, Lists, Reports
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists
 from copem_replay.core.overlap import rotated_iou
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.fusion.base import ListFusion
@@ -40,13 +40,13 @@ class Nms(ListFusion):
 
     resumable: ClassVar[bool] = True
 
-    def fuse(self, reports: Reports) -> Lists:
+    def fuse(self, inputs: Inputs) -> ObjectLists:
         """Every run by itself."""
         runs = []
-        for run in reports.lists.start:
+        for run in inputs.lists.start:
             bounds = run - run[0]
-            entries = reports.lists.entries[run[0] : run[-1]]
-            start, rows = side_by_side(bounds, reports.newest, entries["existence"] >= self.min_existence)
+            entries = inputs.lists.entries[run[0] : run[-1]]
+            start, rows = side_by_side(bounds, inputs.newest, entries["existence"] >= self.min_existence)
             kind = most_probable_of_each(entries["class_probability"])
             # Closer than the sum of both reaches boxes may overlap, and centres do.
             reach_m = np.full(len(entries), self.radius_m / 2)
@@ -54,21 +54,21 @@ class Nms(ListFusion):
                 reach_m = np.hypot(entries["length_m"], entries["width_m"]) / 2
             place = np.stack([entries["x_m"], entries["y_m"], reach_m])
             start, kept = _keep(
-                entries, place, kind, _order(entries, bounds, reports), start, rows, AGREE, self.by == "iou", self.iou
+                entries, place, kind, _order(entries, bounds, inputs), start, rows, AGREE, self.by == "iou", self.iou
             )
             runs.append((start, entries[kept]))
-        fused = run_after_run(runs, len(reports.issue_s))
+        fused = run_after_run(runs, len(inputs.issue_s))
         fused.entries["track_id"] = -1
         return fused
 
 
-def _order(entries: Entries, bounds: Int, reports: Reports) -> Int:
+def _order(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
     """(N,) in which entries are considered: by what they say, and of the very same the first to arrive."""
     f = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
     keys = np.column_stack(
         [
-            -entries["existence"], entries["cov_ee_m2"] + entries["cov_nn_m2"], -reports.captured_s[f],
-            numbers(entries)[:, :WIDTH], reports.arrives_s[f], reports.unit_ix[f],
+            -entries["existence"], entries["cov_ee_m2"] + entries["cov_nn_m2"], -inputs.captured_s[f],
+            numbers(entries)[:, :WIDTH], inputs.arrives_s[f], inputs.unit_ix[f],
         ]
     )  # fmt: skip
     order = np.arange(len(entries))

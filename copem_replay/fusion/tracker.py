@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from copem_replay.core.agree import AGREE
 from copem_replay.core.components import NotNegative, Positive, Share
 from copem_replay.core.interpolation import wrap
-from copem_replay.core.object_list import ENTRY, Lists, Reports, TellsOf
+from copem_replay.core.object_list import ENTRY, Inputs, ObjectLists, TellsOf
 from copem_replay.core.tracks import Float, Int
 from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.content_order import rows_in_order
@@ -75,39 +75,37 @@ class Tracker(ListFusion):
         """How far back lists are heard again."""
         return self.buffer_s if self.late == "replay" else 0.0
 
-    def fuse(self, reports: Reports) -> Lists:
+    def fuse(self, inputs: Inputs) -> ObjectLists:
         """Every run by itself, instant after instant."""
-        return self.resume(reports, None)[0]
+        return self.resume(inputs, None)[0]
 
-    def resume(self, reports: Reports, memory: Sequence[Remembered] | None) -> tuple[Lists, Sequence[Remembered]]:
+    def resume(self, inputs: Inputs, memory: Sequence[Remembered] | None) -> tuple[ObjectLists, Sequence[Remembered]]:
         """The same at the next instants. What is remembered is of each run its tracks."""
         rules = Rules(
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
             self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
         )  # fmt: skip
-        arrived, start = _gone_by(reports) if self.late == "stale" else (reports.arrived, reports.arrived_start)
-        so_far = memory or [nothing_yet(len(reports.units))] * len(reports.lists.start)
-        runs = [
-            fuse_run(_said(reports, s), rules, one, reports.issue_s, arrived, start) for s, one in enumerate(so_far)
-        ]
-        fused = run_after_run([(starts, entries) for starts, entries, _ in runs], len(reports.issue_s))
+        arrived, start = _gone_by(inputs) if self.late == "stale" else (inputs.arrived, inputs.arrived_start)
+        so_far = memory or [nothing_yet(len(inputs.units))] * len(inputs.lists.start)
+        runs = [fuse_run(_said(inputs, s), rules, one, inputs.issue_s, arrived, start) for s, one in enumerate(so_far)]
+        fused = run_after_run([(starts, entries) for starts, entries, _ in runs], len(inputs.issue_s))
         fused.entries["yaw_rad"] = wrap(fused.entries["yaw_rad"])
         return fused, [one for _, _, one in runs]
 
 
-def _gone_by(reports: Reports) -> tuple[Int, Int]:
+def _gone_by(inputs: Inputs) -> tuple[Int, Int]:
     """What arrives, and where that of each instant begins, without what a newer list of its unit has outrun."""
-    instant = np.repeat(np.arange(len(reports.issue_s)), np.diff(reports.arrived_start))
-    kept = reports.newest[instant, reports.unit_ix[reports.arrived]] == reports.arrived
-    start = np.append(0, np.cumsum(np.bincount(instant[kept], minlength=len(reports.issue_s))))
-    return reports.arrived[kept], start.astype(np.int64)
+    instant = np.repeat(np.arange(len(inputs.issue_s)), np.diff(inputs.arrived_start))
+    kept = inputs.newest[instant, inputs.unit_ix[inputs.arrived]] == inputs.arrived
+    start = np.append(0, np.cumsum(np.bincount(instant[kept], minlength=len(inputs.issue_s))))
+    return inputs.arrived[kept], start.astype(np.int64)
 
 
-def _said(reports: Reports, run: int) -> Said:
+def _said(inputs: Inputs, run: int) -> Said:
     """What the units say in one run."""
-    lists = reports.lists
+    lists = inputs.lists
     entries = np.ascontiguousarray(lists.entries[lists.start[run, 0] : lists.start[run, -1]])
     start = lists.start[run] - lists.start[run, 0]
     numbers = entries.view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
     content: Float = numbers[:, :_CONTENT]
-    return Said(start, rows_in_order(start, content), entries, content, reports.captured_s, reports.unit_ix)
+    return Said(start, rows_in_order(start, content), entries, content, inputs.captured_s, inputs.unit_ix)

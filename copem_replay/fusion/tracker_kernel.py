@@ -122,7 +122,7 @@ def _replayed(
 
 @nb.njit(cache=True, nogil=True)
 def _publish(memory: Memory, rules: Rules, now_s: float, out: Entries) -> int:
-    """Writes what is believed now to the front of `out`, and says how much that is."""
+    """Writes the tracks there are now to the front of `out`, and says how much that is."""
     state, P = np.empty(4), np.empty((4, 4))
     n = 0
     for j in range(len(memory.tracks)):

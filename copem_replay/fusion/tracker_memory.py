@@ -1,4 +1,4 @@
-"""What the tracker remembers of one run: from instant to instant, and from one stretch of instants to the next."""
+"""What the tracker remembers of one run: from instant to instant, and from one time chunk of instants to the next."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Memory(NamedTuple):
 
 
 class Remembered(NamedTuple):
-    """What is remembered from one stretch of instants to the next. `heard` and `before` are of `late: replay` alone.
+    """What is remembered from one time chunk of instants to the next. `heard` and `before` are of `late: replay` alone.
 
     The memory before all lists captured at one instant is the same: it is there once, instant after instant, that of
     instant b the next `sizes[b]` of `tracks` and `claims`, and their square of `together_s`.

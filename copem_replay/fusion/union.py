@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.components import Share
-from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import Bool, Int
 from copem_replay.fusion.base import ListFusion
 
@@ -25,27 +25,27 @@ class Union(ListFusion):
 
     resumable: ClassVar[bool] = True
 
-    def fuse(self, reports: Reports) -> Lists:
+    def fuse(self, inputs: Inputs) -> ObjectLists:
         """Every run by itself."""
         runs = []
-        for bounds in reports.lists.start:
-            entries = reports.lists.entries[bounds[0] : bounds[-1]]
-            start, rows = side_by_side(bounds - bounds[0], reports.newest, entries["existence"] >= self.min_existence)
+        for bounds in inputs.lists.start:
+            entries = inputs.lists.entries[bounds[0] : bounds[-1]]
+            start, rows = side_by_side(bounds - bounds[0], inputs.newest, entries["existence"] >= self.min_existence)
             runs.append((start, entries[rows]))
-        fused = run_after_run(runs, len(reports.issue_s))
+        fused = run_after_run(runs, len(inputs.issue_s))
         # Two units' numbers of tracks have nothing to do with each other.
         fused.entries["track_id"] = -1
         return fused
 
 
-def run_after_run(runs: Sequence[tuple[Int, Entries]], instants: int) -> Lists:
+def run_after_run(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectLists:
     """Lists of all runs from each run's, `start (K + 1,)` beginning at 0, and entries."""
     start = np.zeros((len(runs), instants + 1), dtype=np.int64)
     total = 0
     for s, (one, _) in enumerate(runs):
         start[s] = total + one
         total += int(one[-1])
-    return Lists(start, np.concatenate([entries_of(0), *(entries for _, entries in runs)]))
+    return ObjectLists(start, np.concatenate([entries_of(0), *(entries for _, entries in runs)]))
 
 
 @nb.njit(cache=True, nogil=True)

@@ -13,9 +13,9 @@ from copem_replay.core.rotation import turned, yaw_of
 from copem_replay.core.tracks import CLASSES, VALUES, Float
 from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.log import Log
-from copem_replay.io.schemas.decoded import VX, VY, YAW, Columns, Z
+from copem_replay.io.schemas.decoded import VX, VY, YAW, DecodedObjects, Z
 from copem_replay.io.schemas.pose_schemas import ODOMETRY
-from copem_replay.io.transforms import Course, course_of
+from copem_replay.io.transforms import PoseTrack, pose_track_of
 
 if TYPE_CHECKING:
     from copem_replay.io.config import EgoTopic
@@ -43,7 +43,7 @@ def ego_channel(log: Log, channels: Sequence[Channel], asked: EgoTopic | None, s
     return odometry[0] if seek_ego and len(odometry) == 1 else None
 
 
-def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None) -> Course:
+def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None) -> PoseTrack:
     """The course of the ego, of the frame that is asked for. Raises EgoError: no pose, or poses of several frames."""
     child = asked.frame if asked is not None else None
     picked = None if child is None else np.array([name == child.lstrip("/") for name in poses.child], dtype=bool)
@@ -52,7 +52,7 @@ def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None) -> Co
         raise EgoError(
             f"{topic} has poses of several frames; choose with `frame`: {', '.join(children[:_SHOWN])}", path=log.path
         )
-    course = course_of(poses, picked)
+    course = pose_track_of(poses, picked)
     if course is None:
         of = f" of frame {child!r}" if child else ""
         raise EgoError(f"no pose on topic {topic!r}{of}{in_the_window(log)}", path=log.path)
@@ -78,7 +78,7 @@ def ego_notes(chosen: Channel, asked: EgoTopic | None) -> Iterator[str]:
         yield f"ego: no size is said (`size_m: [length, width, height]`): {size} m taken to hide others, gaps are null"
 
 
-def with_ego(columns: Columns, course: Course | None, asked: EgoTopic | None) -> Columns:
+def with_ego(columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic | None) -> DecodedObjects:
     """The ego added to every list at whose instant it has a place; without a course the same columns."""
     if course is None:
         return columns

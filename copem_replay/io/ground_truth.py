@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.io import plausibility as repair
-from copem_replay.io.schemas.decoded import FARTHEST_M, Columns
+from copem_replay.io.schemas.decoded import FARTHEST_M, DecodedObjects
 
 LONGEST_M = 1000.0  # no wall, train or building is longer, wider or higher (chosen)
 _X, _Y, _Z, _YAW, _VX, _VY, _LENGTH, _WIDTH, _HEIGHT = range(len(VALUES))
 
 
-def assemble(columns: Columns, log: str) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
+def assemble(
+    columns: DecodedObjects, log: str
+) -> tuple[Scene, Tracks, tuple[str, ...]] | tuple[None, None, tuple[str, ...]]:
     """Scene (without ego), truth and notes of the log named `log`. No scene where no object is usable."""
     notes: list[str] = []
     kept_list, stamp_ns = _in_order(columns, notes)
@@ -45,7 +47,7 @@ def assemble(columns: Columns, log: str) -> tuple[Scene, Tracks, tuple[str, ...]
     return scene, tracks, tuple(notes)
 
 
-def _in_order(columns: Columns, notes: list[str]) -> tuple[Int, Int]:
+def _in_order(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int]:
     """Which messages are kept, in order of time, and their stamps: (F,) each."""
     stamp_ns, use = columns.stamp_ns, np.ones(len(columns.stamp_ns), dtype=bool)
     if not columns.stamped.all():

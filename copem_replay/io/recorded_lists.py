@@ -24,17 +24,17 @@ from copem_replay.io.messages import gathered
 from copem_replay.io.open import open_log
 from copem_replay.io.recorded_osi import RecordedLists, as_tracks
 from copem_replay.io.schemas.decoded import LAST_NS
-from copem_replay.io.schemas.object_lists import Listed
+from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.window import Window
-from copem_replay.io.world_frame import Surroundings, in_world, lists_of, surroundings
+from copem_replay.io.world_frame import LogContext, in_world, lists_of, log_context
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write.ros2_definitions import STRING
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def read_listed(
-    path: Path, topic: str, scene: Scene, around: Surroundings | None, window: Window | None = None
+    path: Path, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
 ) -> RecordedLists | None:
     """The lists on `topic`, in the world of the truth; None: none of a known format is there. Raises RecordingError."""
     log = open_log(path).within(window)
@@ -44,14 +44,14 @@ def read_listed(
         return _read(log.from_start(error), topic, scene, around)
 
 
-def _read(log: Log, topic: str, scene: Scene, around: Surroundings | None) -> RecordedLists | None:
+def _read(log: Log, topic: str, scene: Scene, around: LogContext | None) -> RecordedLists | None:
     channels = [c for c in known_lists(log.channels) if c.topic == topic]
     if not channels:
         return None
     mine = [c for c in channels if c.schema == channels[0].schema]
     if log.window is not None and next(log.payloads(frozenset(c.number for c in mine)), None) is None:
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
-    around = around or surroundings(log, None, seek_ego=False)
+    around = around or log_context(log, None, seek_ego=False)
     found = in_world(lists_of(log, mine, None), around, log.path, topic)
     return _recorded(found, _details(log, topic), topic, scene)
 
@@ -86,8 +86,8 @@ def _captured(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tuple[In
     return captured, known
 
 
-def _with_details(found: Listed, details: Mapping[int, Mapping[str, Any]]) -> tuple[Listed, Float]:
-    """The lists with sizes and existence as they were believed, and (P, uncertainties) variances, NaN: not said."""
+def _with_details(found: DecodedLists, details: Mapping[int, Mapping[str, Any]]) -> tuple[DecodedLists, Float]:
+    """The lists with sizes and existence as they were stated, and (P, uncertainties) variances, NaN: not said."""
     columns = found.columns
     values, existence = columns.values.copy(), found.existence.copy()
     variances = np.full((len(values), len(UNCERTAINTIES)), np.nan)
@@ -109,7 +109,7 @@ def _number(item: Any, name: str, otherwise: float) -> float:
     return float(value) if isinstance(value, float) else otherwise
 
 
-def _recorded(found: Listed, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene) -> RecordedLists:
+def _recorded(found: DecodedLists, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene) -> RecordedLists:
     found, beside = _with_details(found, details)
     columns = found.columns
     by_time = np.argsort(columns.stamp_ns, kind="stable")

@@ -21,7 +21,7 @@ from copem_replay.io.ground_truth import assemble
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.open import open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
-from copem_replay.io.schemas.decoded import Columns
+from copem_replay.io.schemas.decoded import DecodedObjects
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
 from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not
     from copem_replay.io.config import EgoTopic
     from copem_replay.io.recorded_osi import RecordedLists
     from copem_replay.io.schemas.object_lists import Fields
-    from copem_replay.io.world_frame import Surroundings
+    from copem_replay.io.world_frame import LogContext
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
 _SHOWN = 12  # ids or topics named in an error (chosen)
@@ -56,7 +56,7 @@ class Recording:
     host_id: str | None
     damage: str | None = None  # what is wrong with the file and how far it could be read; among the notes, too
     lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
-    around: Surroundings | None = None  # frames of reference, where lists other than OSI's are read
+    around: LogContext | None = None  # frames of reference, where lists other than OSI's are read
     encoding: str = "protobuf"  # of the messages of the truth
     world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
     window: Window | None = None  # of log time, that was read; None: all
@@ -217,7 +217,7 @@ def _ignored(log: Log, chosen: str, topics: dict[str, str], beside: Collection[s
 
 def _columns(
     log: Log, topic: str, fields: Fields | None, asked: EgoTopic | None, *, seek_ego: bool
-) -> tuple[Columns, Surroundings | None, str]:
+) -> tuple[DecodedObjects, LogContext | None, str]:
     """All that is on a topic, in the world, and the ego; the world's name. Raises RecordingError, BrokenIndexError."""
     channels = [c for c in log.channels if c.topic == topic and c.messages]
     if fields is None and any(not is_truth(c) for c in channels):  # channels of one topic may be of several schemas
@@ -232,14 +232,14 @@ def _columns(
         if asked is None:
             return columns, None, ""
         from copem_replay.io.ego_pose import with_ego
-        from copem_replay.io.world_frame import surroundings
+        from copem_replay.io.world_frame import log_context
 
-        around = surroundings(log, asked, seek_ego=False)
+        around = log_context(log, asked, seek_ego=False)
         return _with_notes(with_ego(columns, around.ego, around.asked), around), around, ""
     from copem_replay.io.ego_pose import with_ego
-    from copem_replay.io.world_frame import in_world, lists_of, surroundings
+    from copem_replay.io.world_frame import in_world, lists_of, log_context
 
-    around = surroundings(log, asked, seek_ego=seek_ego)
+    around = log_context(log, asked, seek_ego=seek_ego)
     mine = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
     found = lists_of(log, mine, fields)
     if (fields is None and not names_objects(mine[0])) or (fields is not None and fields.id is None):
@@ -251,11 +251,11 @@ def _columns(
     return _with_notes(with_ego(found.columns, around.ego, around.asked), around), around, world
 
 
-def _with_notes(columns: Columns, around: Surroundings) -> Columns:
+def _with_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
     return replace(columns, notes=(*columns.notes, *around.notes))
 
 
-def _decode(log: Log, topic: str) -> Columns:
+def _decode(log: Log, topic: str) -> DecodedObjects:
     """All messages of the truth on a topic. Raises BrokenIndexError."""
     schema_of = {c.number: c.schema for c in log.channels if c.topic == topic and is_truth(c)}
     decoder = osi.Decoder()

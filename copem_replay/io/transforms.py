@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PosesAt:
     """Where something was at K instants: `there (K,)`, `position_m (K, 3)`, `rotation (K, 4)` as x, y, z, w."""
 
     there: Bool
@@ -31,7 +31,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Course:
+class PoseTrack:
     """Samples of one pose over time, in order of time, each instant once."""
 
     parent: str
@@ -40,11 +40,11 @@ class Course:
     rotation: Float
     velocity_mps: Float
 
-    def at(self, stamp_ns: Int, *, forever: bool = False) -> Placed:
+    def at(self, stamp_ns: Int, *, forever: bool = False) -> PosesAt:
         """The pose at instants (K,); `forever`: the last sample holds whenever."""
         if forever or len(self.stamp_ns) == 1:
             last = np.full(len(stamp_ns), len(self.stamp_ns) - 1)
-            return Placed(np.ones(len(stamp_ns), dtype=bool), self.position_m[last], self.rotation[last])
+            return PosesAt(np.ones(len(stamp_ns), dtype=bool), self.position_m[last], self.rotation[last])
         after = np.searchsorted(self.stamp_ns, stamp_ns, side="left").clip(1, len(self.stamp_ns) - 1)
         before = after - 1
         apart = self.stamp_ns[after] - self.stamp_ns[before]
@@ -54,47 +54,49 @@ class Course:
         a, b = self.rotation[before], self.rotation[after]
         b = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
         mixed = (1 - share) * a + share * b  # samples are near each other: on the short arc this is the rotation
-        return Placed(
+        return PosesAt(
             there,
             (1 - share) * self.position_m[before] + share * self.position_m[after],
             mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12),
         )
 
 
-def course_of(poses: Poses, chosen: Bool | None = None) -> Course | None:
+def pose_track_of(poses: Poses, chosen: Bool | None = None) -> PoseTrack | None:
     """The samples of one pose in order; of several at one instant the first. None: there is none."""
     rows = np.arange(len(poses.stamp_ns)) if chosen is None else np.flatnonzero(chosen)
     if not len(rows):
         return None
     stamps, first = np.unique(poses.stamp_ns[rows], return_index=True)
     rows = rows[first]
-    return Course(poses.frame[rows[0]], stamps, poses.position_m[rows], poses.rotation[rows], poses.velocity_mps[rows])
+    return PoseTrack(
+        poses.frame[rows[0]], stamps, poses.position_m[rows], poses.rotation[rows], poses.velocity_mps[rows]
+    )
 
 
 @dataclass
 class Frames:
     """The tree of frames: of each child its course in its parent."""
 
-    courses: dict[str, Course] = field(default_factory=dict)
+    pose_tracks: dict[str, PoseTrack] = field(default_factory=dict)
     static: set[str] = field(default_factory=set)
 
     def add(self, poses: Poses, *, static: bool = False) -> None:
         """Take in transforms; a frame that has a parent already keeps it."""
         children = np.array(poses.child, dtype=object)
         for child in dict.fromkeys(poses.child):
-            if not child or child in self.courses:
+            if not child or child in self.pose_tracks:
                 continue
-            course = course_of(poses, np.asarray(children == child))
+            course = pose_track_of(poses, np.asarray(children == child))
             if course is not None and course.parent != child:
-                self.courses[child] = course
+                self.pose_tracks[child] = course
                 if static:
                     self.static.add(child)
 
     def chain(self, frame: str) -> list[str]:
         """From a frame up to its root, both included; a circle ends where it began."""
         found = [frame]
-        while found[-1] in self.courses and self.courses[found[-1]].parent not in found:
-            found.append(self.courses[found[-1]].parent)
+        while found[-1] in self.pose_tracks and self.pose_tracks[found[-1]].parent not in found:
+            found.append(self.pose_tracks[found[-1]].parent)
         return found
 
     def world_of(self, frame: str) -> str:
@@ -103,7 +105,7 @@ class Frames:
         moving = [k for k, name in enumerate(chain[:-1]) if not self._stands(name)]
         return chain[moving[-1] + 1] if moving else frame
 
-    def place(self, frame: str, world: str, stamp_ns: Int) -> Placed | None:
+    def place(self, frame: str, world: str, stamp_ns: Int) -> PosesAt | None:
         """Where `frame` lies in `world` at instants (K,); None: the recording does not say."""
         up, down = self.chain(frame), self.chain(world)
         common = next((name for name in up if name in down), None)
@@ -111,22 +113,22 @@ class Frames:
             return None
         here, there = (self._climb(chain[: chain.index(common)], stamp_ns) for chain in (up, down))
         turn = back(there.rotation)
-        return Placed(
+        return PosesAt(
             here.there & there.there,
             turned(turn, here.position_m - there.position_m),
             combined(turn, here.rotation),
         )
 
-    def _climb(self, steps: Iterable[str], stamp_ns: Int) -> Placed:
+    def _climb(self, steps: Iterable[str], stamp_ns: Int) -> PosesAt:
         """The pose of the first of `steps` in the parent of the last."""
         known = np.ones(len(stamp_ns), dtype=bool)
         position, rotation = np.zeros((len(stamp_ns), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(stamp_ns), 1))
         for name in steps:
-            step = self.courses[name].at(stamp_ns, forever=self._stands(name))
+            step = self.pose_tracks[name].at(stamp_ns, forever=self._stands(name))
             position = turned(step.rotation, position) + step.position_m
             rotation = combined(step.rotation, rotation)
             known &= step.there
-        return Placed(known, position, rotation)
+        return PosesAt(known, position, rotation)
 
     def _stands(self, child: str) -> bool:
-        return child in self.static or len(self.courses[child].stamp_ns) == 1
+        return child in self.static or len(self.pose_tracks[child].stamp_ns) == 1

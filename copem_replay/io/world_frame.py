@@ -24,22 +24,22 @@ from copem_replay.io.encodings.raw_values import DefinitionError
 from copem_replay.io.log import Log
 from copem_replay.io.messages import gathered
 from copem_replay.io.schemas.decoded import VX, VY, YAW, X, Z
-from copem_replay.io.schemas.object_lists import Description, Fields, FieldsError, Listed, listed
+from copem_replay.io.schemas.object_lists import DecodedLists, Description, Fields, FieldsError, listed
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.poses import Poses, poses_of
 from copem_replay.io.schemas.registry import description_of
-from copem_replay.io.transforms import Course, Frames
+from copem_replay.io.transforms import Frames, PoseTrack
 
 if TYPE_CHECKING:
     from copem_replay.io.config import EgoTopic
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class LogContext:
     """What a recording says of places: its frames of reference, and the course of the ego."""
 
     frames: Frames
-    ego: Course | None
+    ego: PoseTrack | None
     asked: EgoTopic | None
     notes: tuple[str, ...]
 
@@ -47,13 +47,13 @@ class Surroundings:
         """The frame that all is brought into, where lists are in `frame`."""
         return self.ego.parent if self.ego is not None else self.frames.world_of(frame)
 
-    def world_of(self, found: Listed) -> str:
+    def world_of(self, found: DecodedLists) -> str:
         """The frame that lists are brought into, "" where no list names one."""
         said = found.frame_code[found.frame_code >= 0]
         return self.world_for(found.frames[said[0]].lstrip("/") if len(said) else "")
 
 
-def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroundings:
+def log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> LogContext:
     """The frames and the ego of a recording; `seek_ego`: the only odometry is the ego's, if nothing is `asked`.
 
     Raises RecordingError: no such topic; BrokenIndexError.
@@ -78,13 +78,13 @@ def surroundings(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> Surroun
         frames.add(poses, static=channel.topic.endswith("tf_static"))
     chosen = ego_channel(log, channels, asked, seek_ego)
     if chosen is None:
-        return Surroundings(frames, None, asked, tuple(notes))
+        return LogContext(frames, None, asked, tuple(notes))
     if not found.payloads[chosen.number]:
         raise EgoError(f"no pose on topic {chosen.topic!r}{in_the_window(log)}", path=log.path)
     if chosen.number not in of_channel:  # which is among the notes
-        return Surroundings(frames, None, asked, tuple(notes))
+        return LogContext(frames, None, asked, tuple(notes))
     course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
-    return Surroundings(frames, course, asked, (*notes, *ego_notes(chosen, asked)))
+    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)))
 
 
 def _bare(poses: Poses) -> Poses:
@@ -94,7 +94,7 @@ def _bare(poses: Poses) -> Poses:
     )
 
 
-def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> Listed:
+def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> DecodedLists:
     """The lists on channels of one topic and schema. Raises RecordingError, BrokenIndexError."""
     found = gathered(log, frozenset(c.number for c in channels))
     payloads = [p for c in channels for p in found.payloads[c.number]]
@@ -109,7 +109,7 @@ def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> Li
     return replace(lists, columns=replace(lists.columns, notes=(*lists.columns.notes, *found.notes())))
 
 
-def in_world(found: Listed, around: Surroundings, path: Path, topic: str) -> Listed:
+def in_world(found: DecodedLists, around: LogContext, path: Path, topic: str) -> DecodedLists:
     """The same lists in the world; states at instants at which their frame is nowhere are left out, and said.
 
     Raises RecordingError, naming `path` and `topic`, where the recording does not say how frames lie to each other.

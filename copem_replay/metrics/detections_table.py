@@ -16,7 +16,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import states_at
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
 from copem_replay.metrics.braking.driver import delays_of
 from copem_replay.metrics.braking.encounter import Encounter
@@ -24,7 +24,7 @@ from copem_replay.metrics.braking.verdict import Verdicts, judge
 from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.end_reason import texts_of
-from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.episodes import Episodes
 from copem_replay.metrics.reference import Reference, reference_at
 from copem_replay.perception.visibility import rectangles
 
@@ -36,20 +36,20 @@ class Events:
     """What one configuration came to know and when, run by run: (S, M), or (1, M) where all runs agree.
 
     `units`: names of those whose indices `detections` has. `in_sight_s`: when any of its units had the object in sight,
-    NaN: never, or not known. `foreseen_s`: when a collision was implied, NaN: never.
+    NaN: never, or not known. `conflict_known_s`: when a collision was implied, NaN: never.
     """
 
     units: tuple[str, ...]
     detections: Detections
     in_sight_s: Float
-    foreseen_s: Float | None = None
+    conflict_known_s: Float | None = None
 
 
 def table(
     scene: Scene,
     truth: Tracks,
     experiment: MetricsSetup,
-    found: Looks,
+    found: Episodes,
     meeting: Sequence[Encounter],
     runs: Int,
     events: Mapping[str, Events],
@@ -70,7 +70,7 @@ def table(
 
 
 def _columns(
-    scene: Scene, truth: Tracks, experiment: MetricsSetup, found: Looks, runs: Int, configuration: str, known: Events
+    scene: Scene, truth: Tracks, experiment: MetricsSetup, found: Episodes, runs: Int, configuration: str, known: Events
 ) -> dict[str, Any]:
     """Columns (S · M,) of one configuration: what was known, when and how far away."""
     S, M = len(runs), len(found.object_ix)
@@ -102,19 +102,19 @@ def _columns(
         "ended_by": texts_of(flat(found.ended_by)),
         "first_unit": names[flat(result.first_unit_ix)],
     }
-    if known.foreseen_s is not None:
-        foreseen_s = flat(known.foreseen_s)
-        away_m, _ = distances(scene, truth, experiment, flat(found.object_ix), foreseen_s)
+    if known.conflict_known_s is not None:
+        conflict_known_s = flat(known.conflict_known_s)
+        away_m, _ = distances(scene, truth, experiment, flat(found.object_ix), conflict_known_s)
         columns |= {
-            "conflict_detected": ~np.isnan(foreseen_s),
-            "conflict_detection_s": foreseen_s,
-            "time_to_conflict_detection_s": foreseen_s - onset_s,
+            "conflict_detected": ~np.isnan(conflict_known_s),
+            "conflict_detection_s": conflict_known_s,
+            "time_to_conflict_detection_s": conflict_known_s - onset_s,
             "distance_at_conflict_detection_m": away_m,
         }
     return columns
 
 
-def _delays(scene: Scene, experiment: MetricsSetup, found: Looks, runs: Int) -> Float | None:
+def _delays(scene: Scene, experiment: MetricsSetup, found: Episodes, runs: Int) -> Float | None:
     """(S, M) seconds the driver takes to react to each object, the same in every configuration. None without braking.
 
     Addressed by the object and the onset's stamp: what is reacted to, not when it came to be known.
@@ -124,25 +124,25 @@ def _delays(scene: Scene, experiment: MetricsSetup, found: Looks, runs: Int) -> 
     none = np.zeros(len(found.object_ix), dtype=np.int64)
     words = object_words([scene.object_ids[k] for k in found.object_ix])
     stamp_ns = scene.t0_ns + np.rint(found.onset_s * 1e9).astype(np.int64)
-    uniform = Dice(experiment.seed, scene.log).uniform("reaction", Address(("",), none, words, stamp_ns), runs)
+    uniform = CounterRng(experiment.seed, scene.log).uniform("reaction", RandomKey(("",), none, words, stamp_ns), runs)
     return delays_of(experiment.braking.driver.reaction, uniform.ravel()).reshape(uniform.shape)
 
 
 def _braking(
-    experiment: MetricsSetup, found: Looks, meeting: Sequence[Encounter], delay_s: Float, known: Events
+    experiment: MetricsSetup, found: Episodes, meeting: Sequence[Encounter], delay_s: Float, known: Events
 ) -> dict[str, Any]:
-    """Columns (S · M,) of one configuration: the verdicts of the looks in conflict; null for the others."""
+    """Columns (S · M,) of one configuration: the verdicts of the episodes in conflict; null for the others."""
     braking = experiment.braking
     assert braking is not None
     shape = delay_s.shape
-    event_s = known.detections.detection_s if braking.brakes_for == "object" else known.foreseen_s
+    event_s = known.detections.detection_s if braking.brakes_for == "object" else known.conflict_known_s
     assert event_s is not None
     # What is known before the onset is no hazard yet.
     brake_s = np.maximum(np.broadcast_to(event_s, shape), found.onset_s) + delay_s
     in_conflict = np.zeros(shape, dtype=bool)
     numbers = {name: np.full(shape, np.nan) for name in Verdicts.__dataclass_fields__}
     for encounter in meeting:
-        m = encounter.look_ix
+        m = encounter.episode_ix
         in_conflict[:, m] = True
         verdicts = judge(encounter, braking.driver, np.where(np.isnan(brake_s[:, m]), np.inf, brake_s[:, m]))
         for name, values in numbers.items():

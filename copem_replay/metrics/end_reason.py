@@ -39,7 +39,7 @@ _WORDS = {
     EndReason.LOG_END: ("log ends", "the log ended"),
 }
 END_REASONS = tuple(EndReason)
-"""What positions such as `Looks.ended_by` count in."""
+"""What positions such as `Episodes.ended_by` count in."""
 COMPETES = tuple(reason.value for reason in END_REASONS if not reason.censors)
 """Texts of the reasons that are no censoring."""
 

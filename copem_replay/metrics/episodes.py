@@ -1,8 +1,8 @@
 """From when, and until when, do we look at an object?
 
-Onset: the first frame at which its condition holds while the ego is in the log. The look ends at the object's own last
-frame (`object_left`: not seen by then, it is never detected), the ego's (`ego_left`) or the log's (`log_end`); only
-the last two are censoring. Source of the meanings: docs/measures.md.
+Onset: the first frame at which its condition holds while the ego is in the log. The episode ends at the object's own
+last frame (`object_left`: not seen by then, it is never detected), the ego's (`ego_left`) or the log's (`log_end`);
+only the last two are censoring. Source of the meanings: docs/measures.md.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
-class Looks:
-    """One look per measured object that has an onset. All (M,)."""
+class Episodes:
+    """One episode per measured object that has an onset. All (M,)."""
 
     object_ix: Int
     onset_s: Float
@@ -49,7 +49,7 @@ def measured_objects(scene: Scene, measure: Measure) -> Int:
     return np.flatnonzero(chosen)
 
 
-def looks(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup) -> Looks:
+def episodes(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup) -> Episodes:
     """Onset and end of every measured object that has an onset (`truth`: the world at its own frames)."""
     measure = experiment.measure
     wanted = np.isin(truth.object_ix, measured_objects(scene, measure))
@@ -83,7 +83,7 @@ def looks(scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup
     ended_by = np.where(object_left, left, np.where(ego_left, ego, end))
     order = np.flatnonzero(found)
     order = order[np.argsort(world.object_ix[order], kind="stable")]
-    return Looks(world.object_ix[order], onset_s[order], at_start[order], ended_s[order], ended_by[order])
+    return Episodes(world.object_ix[order], onset_s[order], at_start[order], ended_s[order], ended_by[order])
 
 
 def _ego_stay(scene: Scene, truth: Tracks) -> tuple[float, float, Bool]:

@@ -1,12 +1,12 @@
 """How far is a list from the truth? GOSPA (α = 2) with its parts, and OSPA, of positions without identities.
 
-Both are metrics between finite sets of points, with a cut-off c and a power p ≥ 1. A truth and a believed object may be
-paired where they are nearer than c, and the pairs are those of least total cost:
+Both are metrics between finite sets of points, with a cut-off c and a power p ≥ 1. A true and an estimated object may
+be paired where they are nearer than c, and the pairs are those of least total cost:
 
-GOSPA = (Σ dᵖ + cᵖ/2 · missed + cᵖ/2 · false)^(1/p), over the pairs, the truths and the believed without a partner;
+GOSPA = (Σ dᵖ + cᵖ/2 · missed + cᵖ/2 · false)^(1/p), over the pairs, true and estimated objects without a partner;
 OSPA = ((Σ dᵖ + cᵖ · (max(n, m) − pairs)) / max(n, m))^(1/p): an average, so that in a long list one error is small.
 
-One set of pairs serves both. Two empty lists are at distance 0. Letters: n truths, m believed objects.
+One set of pairs serves both. Two empty lists are at distance 0. Letters: n truths, m estimated objects.
 
 Source: A. S. Rahmathullah, Á. F. García-Fernández, L. Svensson, "Generalized optimal sub-pattern assignment metric",
 FUSION 2017; D. Schuhmacher, B.-T. Vo, B.-N. Vo, "A consistent metric for performance evaluation of multi-object
@@ -35,11 +35,11 @@ class Gospa:
     false: float
     missed_count: int
     false_count: int
-    partner: Int  # (n,) the believed object of each truth, −1: missed
+    partner: Int  # (n,) the estimated object of each truth, −1: missed
 
 
-def gospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> Gospa:
-    """GOSPA between `truth (n, 2)` and `believed (m, 2)`, metres.
+def gospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> Gospa:
+    """GOSPA between `truth (n, 2)` and `estimates (m, 2)`, metres.
 
     Raises ValueError for other shapes, for positions that are not finite, for a cut-off not above 0, for a power
     below 1 or infinite, and where the cut-off to that power is too large or too small a number.
@@ -50,7 +50,7 @@ def gospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> Go
     >>> found.value_m, found.localisation, found.missed_count
     (8.0, 5.0, 1)
     """
-    x, y = _points("truth", truth), _points("believed", believed)
+    x, y = _points("truth", truth), _points("estimates", estimates)
     unit = _unit(cutoff_m, power)
     n, m = x.shape[1], y.shape[1]
     partner = np.empty(n, dtype=np.int64)
@@ -60,8 +60,8 @@ def gospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> Go
     return Gospa(value_m, localisation, missed, false, n - pairs, m - pairs, partner)
 
 
-def ospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> float:
-    """OSPA between `truth (n, 2)` and `believed (m, 2)`, metres.
+def ospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> float:
+    """OSPA between `truth (n, 2)` and `estimates (m, 2)`, metres.
 
     Of infinite power: the largest distance of a pair, where that is smallest; c where the lists differ in length.
     Raises ValueError as `gospa` does, but for the infinite power.
@@ -72,8 +72,8 @@ def ospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> flo
     5.5
     """
     if power == math.inf:
-        return _bottleneck(_points("truth", truth), _points("believed", believed), _unit(cutoff_m, 1.0))
-    result = gospa(truth, believed, cutoff_m=cutoff_m, power=power)
+        return _bottleneck(_points("truth", truth), _points("estimates", estimates), _unit(cutoff_m, 1.0))
+    result = gospa(truth, estimates, cutoff_m=cutoff_m, power=power)
     n = len(result.partner)
     m = n - result.missed_count + result.false_count
     if max(n, m) == 0:
@@ -86,7 +86,7 @@ def ospa(truth: Float, believed: Float, *, cutoff_m: float, power: float) -> flo
 def gospa_pairs(
     tx: Float, ty: Float, bx: Float, by: Float, cutoff_m: float, power: float, partner: Int
 ) -> tuple[float, int]:
-    """Pair truths at `tx, ty (n,)` with believed objects at `bx, by (m,)`. NaN is near to nothing; nothing is checked.
+    """Pair truths at `tx, ty (n,)` with estimates at `bx, by (m,)`. NaN is near to nothing; nothing is checked.
 
     Out: `partner (n,)`, −1: missed. Gives Σ dᵖ over the pairs, and how many they are.
     """

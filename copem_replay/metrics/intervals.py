@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Float, Int
 
 Counts = NDArray[np.uint32]
@@ -70,10 +70,10 @@ def resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resam
     if len(names) < DRAWN_FROM:
         return every_resample(len(names))
     zeros = np.zeros(len(names), dtype=np.int64)
-    address, dice = Address(("",), zeros, object_words(names), zeros), Dice(seed, "summary")
+    random_key, rng = RandomKey(("",), zeros, object_words(names), zeros), CounterRng(seed, "summary")
     size = max(1, _CELLS // len(names))
     blocks = [np.arange(r, min(r + size, number)) for r in range(0, number, size)]
-    count = np.concatenate([multiplicities(dice.uniform("bootstrap", address, block)) for block in blocks])
+    count = np.concatenate([multiplicities(rng.uniform("bootstrap", random_key, block)) for block in blocks])
     return Resamples(count, np.ones(number, dtype=np.int64))
 
 

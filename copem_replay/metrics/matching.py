@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.agree import AGREE
 from copem_replay.core.agree import most_probable as most_probable_class
-from copem_replay.core.object_list import Entries, Lists, TellsOf
+from copem_replay.core.object_list import Entries, ObjectLists, TellsOf
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
 
 MATCH, DUPLICATE, GHOST = 0, 1, 2
@@ -52,7 +52,7 @@ class Matches:
     class_ix: NDArray[np.int8]  # its own most probable class
 
 
-def match(lists: Lists, world: Tracks, scene: Scene, *, gate_m: float, tells_of: TellsOf = "now") -> Matches:
+def match(lists: ObjectLists, world: Tracks, scene: Scene, *, gate_m: float, tells_of: TellsOf = "now") -> Matches:
     """What the entries of K lists in S runs are about, at the instants they tell of.
 
     `world`: the truth. Where entries tell of `now` its frame k is at the instant list k is available, where they tell
@@ -64,7 +64,9 @@ def match(lists: Lists, world: Tracks, scene: Scene, *, gate_m: float, tells_of:
     return Matches(*out)
 
 
-def match_both(lists: Lists, then: Tracks, now: Tracks, scene: Scene, *, gate_m: float) -> tuple[Matches, Matches]:
+def match_both(
+    lists: ObjectLists, then: Tracks, now: Tracks, scene: Scene, *, gate_m: float
+) -> tuple[Matches, Matches]:
     """What entries that tell of their `capture` are about; and what they would be about if they told of `now`.
 
     `then`, `now`: the truth, as `match` has it for these.
@@ -85,7 +87,7 @@ class _Out(NamedTuple):
     class_ix: NDArray[np.int8]
 
 
-def _nothing(lists: Lists) -> _Out:
+def _nothing(lists: ObjectLists) -> _Out:
     N = len(lists.entries)
     none = np.full(N, GHOST, dtype=np.int8)
     return _Out(np.full(N, -1), none, np.empty(N), np.empty(N), np.empty(N, dtype=np.int8))

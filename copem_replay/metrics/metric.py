@@ -82,6 +82,13 @@ class RowMetric(Component, ABC):
     """Base of own metrics: sums over rows of `detections.parquet`, and a value made of the sums.
 
     `name`: the column; units belong in it. `help`: its meaning in one clause, for the report. `better` as in `Metric`.
+
+    >>> class Late(cr.RowMetric):
+    ...     def statistics(self, rows):
+    ...         return {"late": (rows["time_to_detection_s"] > 0.5).to_numpy(), "rows": np.ones(len(rows))}
+    ...
+    ...     def value(self, sums):
+    ...         return sums["late"] / sums["rows"]
     """
 
     help: ClassVar[str] = ""

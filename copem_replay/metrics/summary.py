@@ -21,7 +21,7 @@ MUCH_BEYOND = 0.01
 
 
 def horizon_s(table: pd.DataFrame, given_s: float | None) -> float | None:
-    """The horizon of restricted means: as given, or the longest look at any measured object."""
+    """The horizon of restricted means: as given, or the longest episode at any measured object."""
     if given_s is not None:
         return given_s
     return float((table["ended_s"] - table["onset_s"]).max()) if len(table) else None

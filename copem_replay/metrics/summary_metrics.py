@@ -158,7 +158,7 @@ def passed(given: Given) -> Share | None:
 
 @dataclass(frozen=True)
 class Exact:
-    """What the runs tend to: every look counts the same, its rows of `exact.parquet` by their probability."""
+    """What the runs tend to: every episode counts the same, its rows of `exact.parquet` by their probability."""
 
     share: float | None
     times: Detections
@@ -168,7 +168,7 @@ class Exact:
 def exact(given: Given) -> Exact | None:
     """Statistics of `exact.parquet`.
 
-    Among n rows less than one is nobody: with censoring, a look that is still open with probability 10⁻⁹ would
+    Among n rows less than one is nobody: with censoring, an episode that is still open with probability 10⁻⁹ would
     otherwise stand for all that were censored before.
     """
     part = given.exact
@@ -185,9 +185,10 @@ def exact(given: Given) -> Exact | None:
 
 
 def _missed(never: pd.DataFrame) -> dict[str, float | None]:
-    """How probably a look misses its object, from the rows of `exact.parquet` for never: one per look.
+    """How probably an episode misses its object, from the rows of `exact.parquet` for never: one per episode.
 
-    In logarithms; the derivative by the log-odds of detection is that of the mean, so looks count by their share of it.
+    In logarithms; the derivative by the log-odds of detection is that of the mean, so episodes
+    count by their share of it.
     """
     names = ("miss_log10", "miss_log10_half_odds")
     if not never["miss_log10"].notna().any():
@@ -294,7 +295,7 @@ _EXACT_METRICS = (
     _exact_metric("ttd_rmst_s", lambda of: of.times.mean_s(), -1),
     _exact_metric("dad_median_m", lambda of: of.times.distance_quantile_m(0.5), 1),
     _exact_metric("dad_p5_m", lambda of: of.times.distance_quantile_m(0.05), 1),
-    _exact_missed("miss_log10", "log₁₀ of the mean probability that a look misses its object"),
+    _exact_missed("miss_log10", "log₁₀ of the mean probability that an episode misses its object"),
     _exact_missed("miss_log10_half_odds", "the same with the odds of every detection halved"),
     _exact_missed("miss_per_logit", "d ln of that probability by the log-odds of every detection"),
     Metric("pass_share_exact", judged, itemgetter(0), 1, "the same without a draw", "braking"),

@@ -15,45 +15,45 @@ import numpy as np
 
 from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
 from copem_replay.core.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import applies
 from copem_replay.perception.pem.detection import probability_of
-from copem_replay.perception.sensor_poses import Placed, Poses, observers, place
+from copem_replay.perception.sensor_poses import SensorPoses, UnitPoses, observers, place
 from copem_replay.perception.visibility import visible_shares
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """True states of all candidate rows (one run), how they look, and with which probability they are listed.
+class Observations:
+    """True states of all observation rows (one run), their view geometry, and with which probability they are listed.
 
     `couple_ix (P,)`: the couple of the unit's PEM that applies, −1: none. `probability (P,)`, and `existence (P,)` as
     the unit claims it of what it lists. The units and their lists are in the experiment's order.
     """
 
     tracks: Tracks
-    look: Look
+    view: ViewGeometry
     couple_ix: Int
     probability: Float
     existence: Float
 
-    def of_objects(self, object_ix: Int) -> Candidates:
+    def of_objects(self, object_ix: Int) -> Observations:
         """Only the rows of some objects: for what concerns each object by itself."""
         of_track = np.isin(self.tracks.object_ix, object_ix)
         return self if of_track.all() else self.take_rows(np.flatnonzero(of_track[self.tracks.track_ix]))
 
-    def take_rows(self, rows: Int) -> Candidates:
+    def take_rows(self, rows: Int) -> Observations:
         """Only some rows, ascending (K,)."""
-        return Candidates(
+        return Observations(
             self.tracks.take_rows(rows),
-            self.look.take(rows),
+            self.view.take(rows),
             self.couple_ix[rows],
             self.probability[rows],
             self.existence[rows],
         )
 
     @cached_property
-    def listable(self) -> Candidates:
+    def listable(self) -> Observations:
         """Only the rows that are listed with any probability: the others are in no list of any run."""
         return self if (self.probability > 0).all() else self.take_rows(np.flatnonzero(self.probability > 0))
 
@@ -65,7 +65,7 @@ class Candidates:
 
 
 class KeptShares:
-    """Visible shares of stretches of a log: what takes longest of their candidates, and least to keep.
+    """Visible shares of time chunks of a log: what takes longest of their observations, and least to keep.
 
     Kept as long as there is room: one number of each row, where the rows themselves would be forty.
     """
@@ -101,8 +101,8 @@ class KeptShares:
         return found
 
 
-def joined_stretches(pieces: Sequence[Candidates]) -> Candidates:
-    """Rows of stretches that follow each other, as of one."""
+def joined_chunks(pieces: Sequence[Observations]) -> Observations:
+    """Rows of time chunks that follow each other, as of one."""
     if len(pieces) == 1:
         return pieces[0]
     tracks, order = spliced([piece.tracks for piece in pieces])
@@ -110,31 +110,33 @@ def joined_stretches(pieces: Sequence[Candidates]) -> Candidates:
     def rows(columns: Sequence[Any]) -> Any:
         return np.concatenate(columns)[order]
 
-    look = Look(**{f: rows([getattr(piece.look, f) for piece in pieces]) for f in Look.__dataclass_fields__})
+    view = ViewGeometry(
+        **{f: rows([getattr(piece.view, f) for piece in pieces]) for f in ViewGeometry.__dataclass_fields__}
+    )
     more = (rows([getattr(piece, f) for piece in pieces]) for f in ("couple_ix", "probability", "existence"))
-    return Candidates(tracks, look, *more)
+    return Observations(tracks, view, *more)
 
 
-def candidates(
+def observations(
     scene: Scene,
     truth: Tracks,
     experiment: PerceptionSetup,
-    placed: Placed | None = None,
+    placed: SensorPoses | None = None,
     *,
     from_s: float = -np.inf,
     until_s: float = np.inf,
     kept: KeptShares | None = None,
     cut_s: float | None = None,
-) -> Candidates:
-    """All candidate rows of an experiment's units over one log (`truth`: the world at its own frames).
+) -> Observations:
+    """All observation rows of an experiment's units over one log (`truth`: the world at its own frames).
 
-    Of a stretch only the rows captured from an instant on and before another; lists are always all there. `placed`:
+    Of a time chunk only the rows captured from an instant on and before another; lists are always all there. `placed`:
     where the units are, None: to be found out. `kept`: of the same log and units; `cut_s`: from where on other calls
     will ask for the same rows, None: `from_s`.
     """
     if placed is None:
         placed = place(scene, truth, experiment)
-    pieces: dict[str, tuple[Tracks, Look]] = {}
+    pieces: dict[str, tuple[Tracks, ViewGeometry]] = {}
     for names, world in worlds(scene, truth, experiment, placed, from_s, until_s):
         places = [placed.poses[name] for name in names]
         carriers = np.array([placed.carrier_ix[name] for name in names])
@@ -145,18 +147,18 @@ def candidates(
             pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
     ordered = [pieces[name] for name in experiment.modelled]
     tracks = joined(tuple(experiment.modelled), [piece[0] for piece in ordered])
-    look = Look(
+    view = ViewGeometry(
         **{
             name: np.concatenate([np.empty(0), *(getattr(piece[1], name) for piece in ordered)])
-            for name in Look.__dataclass_fields__
+            for name in ViewGeometry.__dataclass_fields__
         }
     )
-    look = replace(look, class_ix=scene.object_class[tracks.row_object_ix])
-    return Candidates(tracks, look, *_assess(tracks, look, experiment))
+    view = replace(view, class_ix=scene.object_class[tracks.row_object_ix])
+    return Observations(tracks, view, *_assess(tracks, view, experiment))
 
 
 def worlds(
-    scene: Scene, truth: Tracks, experiment: PerceptionSetup, placed: Placed, from_s: float, until_s: float
+    scene: Scene, truth: Tracks, experiment: PerceptionSetup, placed: SensorPoses, from_s: float, until_s: float
 ) -> Iterator[tuple[list[str], Tracks]]:
     """The world at the lists of the modelled units, once for all that have theirs at the same instants (by name)."""
     together: dict[bytes, list[str]] = {}
@@ -177,8 +179,8 @@ def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float, from_s: f
     return world.captured_between(from_s, until_s)
 
 
-def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple[Tracks, Look]:
-    """The candidate rows of one unit: all but its carrier, at the lists it exists for."""
+def _from_unit(world: Tracks, at: UnitPoses, carrier_ix: int, share: Float) -> tuple[Tracks, ViewGeometry]:
+    """The observation rows of one unit: all but its carrier, at the lists it exists for."""
     keep = at.present[world.frame_ix] & (world.row_object_ix != carrier_ix)
     frames = np.flatnonzero(at.present)
     frame_number = np.cumsum(at.present) - 1
@@ -200,7 +202,7 @@ def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple
     )
     dx, dy = tracks.x_m[0] - at.x_m[frame], tracks.y_m[0] - at.y_m[frame]
     bearing = np.arctan2(dy, dx)
-    look = Look(
+    view = ViewGeometry(
         range_m=np.hypot(dx, dy),
         azimuth_rad=wrap(bearing - at.heading_rad[frame]),
         bearing_rad=bearing,
@@ -212,24 +214,24 @@ def _from_unit(world: Tracks, at: Poses, carrier_ix: int, share: Float) -> tuple
         yaw_rad=tracks.yaw_rad[0],
         speed_mps=np.hypot(tracks.vx_mps[0], tracks.vy_mps[0]),
     )
-    return tracks, look
+    return tracks, view
 
 
-def _assess(tracks: Tracks, look: Look, experiment: PerceptionSetup) -> tuple[Int, Float, Float]:
+def _assess(tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup) -> tuple[Int, Float, Float]:
     """Which couple of its unit's PEM applies to each row, the probability it gives, and the existence it claims."""
     couple_ix = np.full(len(tracks.frame_ix), -1)
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
-        seen = look.take(rows)
+        seen = view.take(rows)
         pem = experiment.pems[str(unit.pem)]
         couple_ix[rows] = applies(pem, seen)
         for c, couple in enumerate(pem):
             mine = rows[couple_ix[rows] == c]
             if len(mine):
                 where = f"pems.{unit.pem}[{c}].detection"
-                probability[mine] = probability_of(couple.detection, look.take(mine), where)
+                probability[mine] = probability_of(couple.detection, view.take(mine), where)
                 claimed = couple.existence
-                existence[mine] = look.visible_share[mine] if claimed == "visible_share" else claimed
+                existence[mine] = view.visible_share[mine] if claimed == "visible_share" else claimed
     return couple_ix, probability, existence
 
 

@@ -12,10 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from copem_replay.core.interpolation import wrap
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.config import PerceptionSetup
-from copem_replay.perception.observation import Candidates, rows_by_unit
+from copem_replay.perception.observation import Observations, rows_by_unit
 from copem_replay.perception.pem.error import errors_of
 
 SMALLEST_SIZE_M = 0.05
@@ -24,7 +24,7 @@ SMALLEST_SIZE_M = 0.05
 
 def perceive(
     scene: Scene,
-    found: Candidates,
+    found: Observations,
     experiment: PerceptionSetup,
     runs: Int,
     *,
@@ -38,37 +38,37 @@ def perceive(
     does not depend on `states`.
     """
     tracks = found.tracks
-    dice = Dice(experiment.seed, scene.log)
-    address = Address(
+    rng = CounterRng(experiment.seed, scene.log)
+    random_key = RandomKey(
         tracks.units,
         tracks.row_unit_ix,
         object_words(scene.object_ids)[tracks.row_object_ix],
         tracks.stamp_ns[tracks.frame_ix],
     )
-    valid = dice.bernoulli("detection", address, runs, found.probability)
+    valid = rng.bernoulli("detection", random_key, runs, found.probability)
     if equipped is not None:
         valid &= equipped[:, tracks.row_unit_ix]
     seen = replace(tracks, valid=valid)
     if states == "true":
         return seen
-    return _with_errors(seen, found, experiment, _Draws(dice, address, runs, valid, states == "expected"))
+    return _with_errors(seen, found, experiment, _Draws(rng, random_key, runs, valid, states == "expected"))
 
 
 class _Draws:
     """Hands standard normals to the error models, by row; zeros where the expected state is asked for."""
 
-    def __init__(self, dice: Dice, address: Address, runs: Int, valid: Bool, zero: bool) -> None:
-        self._dice, self._address, self._runs, self._valid, self._zero = dice, address, runs, valid, zero
+    def __init__(self, rng: CounterRng, random_key: RandomKey, runs: Int, valid: Bool, zero: bool) -> None:
+        self._rng, self._address, self._runs, self._valid, self._zero = rng, random_key, runs, valid, zero
 
     def normal(self, rows: Int, name: str) -> Float:
         if self._zero:
             return np.zeros((len(self._runs), len(rows)))
-        return self._dice.normal(
+        return self._rng.normal(
             f"error {name}", self._address.take(rows), self._runs, np.ascontiguousarray(self._valid[:, rows])
         )
 
 
-def _with_errors(seen: Tracks, found: Candidates, experiment: PerceptionSetup, draws: _Draws) -> Tracks:
+def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: _Draws) -> Tracks:
     S, P = seen.valid.shape
     columns: dict[str, Any] = {}
 
@@ -89,7 +89,7 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: PerceptionSetup, d
             if couple.error is None or not len(rows):
                 continue
             where = f"pems.{unit.pem}[{c}].error"
-            errors = errors_of(couple.error, found.look.take(rows), partial(draws.normal, rows), S, where)
+            errors = errors_of(couple.error, found.view.take(rows), partial(draws.normal, rows), S, where)
             per_run("x_m")[:, rows] += errors.east_m
             per_run("y_m")[:, rows] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
@@ -104,7 +104,7 @@ def _with_errors(seen: Tracks, found: Candidates, experiment: PerceptionSetup, d
                     size[:, rows] = np.maximum(size[:, rows] + errors.size_m[axis], SMALLEST_SIZE_M)
                 spread["size_var_m2"][0, rows] = errors.size_var_m2
             if errors.speed_mps is not None:
-                speed = found.look.speed_mps[rows]
+                speed = found.view.speed_mps[rows]
                 # Along the direction of travel; of the heading where the object stands.
                 east = np.where(
                     speed > 0, seen.vx_mps[0, rows] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, rows])

@@ -17,7 +17,7 @@ GROUND_WITHIN_M = 50.0
 
 
 @dataclass(frozen=True)
-class Poses:
+class UnitPoses:
     """One unit at the instants of its lists. All (F,); NaN under `present == False`."""
 
     x_m: Float
@@ -28,22 +28,22 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Placed:
+class SensorPoses:
     """All modelled units at each of their lists, in the experiment's order, and the static obstacles around them."""
 
     stamps_ns: dict[str, Int]  # (F,) captures
-    poses: dict[str, Poses]
+    poses: dict[str, UnitPoses]
     carrier_ix: dict[str, int]  # −1: a fixed place
     static: Statics
     notes: tuple[str, ...]
 
 
-def place(scene: Scene, truth: Tracks, experiment: PerceptionSetup) -> Placed:
+def place(scene: Scene, truth: Tracks, experiment: PerceptionSetup) -> SensorPoses:
     """Where the units of an experiment are over one log (`truth`: the world at its own frames)."""
     notes: list[str] = []
     static = place_obstacles(truth, experiment.obstacles, notes)
     stamps: dict[str, Int] = {}
-    there: dict[str, Poses] = {}
+    there: dict[str, UnitPoses] = {}
     carriers = {name: carrier(scene, unit) for name, unit in experiment.modelled.items()}
     for name, unit in experiment.modelled.items():
         stamps[name] = list_instants(scene, truth, unit)
@@ -51,7 +51,7 @@ def place(scene: Scene, truth: Tracks, experiment: PerceptionSetup) -> Placed:
         if unit.rate_hz is not None:
             host = at_instants(host, stamps[name], t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
         there[name] = poses(scene, unit, host, unit_ground(truth, name, unit, notes))
-    return Placed(stamps, there, carriers, static, tuple(notes))
+    return SensorPoses(stamps, there, carriers, static, tuple(notes))
 
 
 def list_instants(scene: Scene, truth: Tracks, unit: Placement) -> Int:
@@ -66,7 +66,7 @@ def list_instants(scene: Scene, truth: Tracks, unit: Placement) -> Int:
     return stamps
 
 
-def poses(scene: Scene, unit: Placement, world: Tracks, ground_m: float) -> Poses:
+def poses(scene: Scene, unit: Placement, world: Tracks, ground_m: float) -> UnitPoses:
     """Where a unit is at each list of `world`, which holds its carrier at the unit's list instants."""
     n = len(world.stamp_ns)
     if unit.at is not None:
@@ -86,7 +86,7 @@ def poses(scene: Scene, unit: Placement, world: Tracks, ground_m: float) -> Pose
         z[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2 + height_m
         x, y = moved(x, y, yaw, unit.offset_m)
         heading = wrap(yaw + np.deg2rad(unit.yaw_deg))
-    return Poses(x, y, z, heading, present)
+    return UnitPoses(x, y, z, heading, present)
 
 
 def moved(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[float, float]) -> tuple[Float, Float]:
@@ -96,7 +96,7 @@ def moved(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[float, flo
     return x_m + cos * forward - sin * left, y_m + sin * forward + cos * left
 
 
-def observers(places: Sequence[Poses], carriers: Int) -> Observers:
+def observers(places: Sequence[UnitPoses], carriers: Int) -> Observers:
     """Units at the lists of one world, as visibility wants them; `carriers (U,)` object indices."""
     return Observers(
         np.stack([np.stack([p.x_m, p.y_m, p.z_m], axis=-1) for p in places]),

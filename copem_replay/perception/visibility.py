@@ -85,7 +85,12 @@ class Observers:
 
 
 class VisibilityModel(Component, ABC):
-    """Base of what `visibility:` may name: how much of each object shows. A list depends on no other list."""
+    """Base of what `visibility:` may name: how much of each object shows. A list depends on no other list.
+
+    >>> class Nothing(cr.VisibilityModel):
+    ...     def shares(self, world, static, observers):
+    ...         return np.ones((len(observers.carrier_ix), len(world.frame_ix)))
+    """
 
     @abstractmethod
     def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:

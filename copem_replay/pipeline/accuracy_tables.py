@@ -22,7 +22,7 @@ import pyarrow as pa
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, total
 from copem_replay.pipeline.blocks import Outcome
-from copem_replay.pipeline.scoring import Appraisal
+from copem_replay.pipeline.scoring import Scores
 
 
 def with_accuracy(outcome: Outcome) -> pd.DataFrame:
@@ -106,10 +106,10 @@ def accuracy_tables(outcomes: Sequence[Outcome], order: Int, *, same_units: bool
     return AccuracyTables(per_list, instants, _lists(outcomes), _thresholds(outcomes, place), bands(outcomes))
 
 
-def _accuracies(outcome: Outcome) -> Iterable[tuple[str, Appraisal, Accuracy]]:
-    for name, appraisal in outcome.appraisals.items():
-        if appraisal.accuracy is not None:
-            yield name, appraisal, appraisal.accuracy
+def _accuracies(outcome: Outcome) -> Iterable[tuple[str, Scores, Accuracy]]:
+    for name, scores in outcome.all_scores.items():
+        if scores.accuracy is not None:
+            yield name, scores, scores.accuracy
 
 
 def _per_list(outcomes: Sequence[Outcome]) -> pa.Table:
@@ -147,8 +147,8 @@ def _per_list(outcomes: Sequence[Outcome]) -> pa.Table:
 def _instants(outcomes: Sequence[Outcome]) -> pa.Table:
     rows: dict[tuple[str, str], Float] = {}
     for outcome in outcomes:
-        for name, appraisal, _ in _accuracies(outcome):
-            rows.setdefault((outcome.log, name), appraisal.issue_s)
+        for name, scores, _ in _accuracies(outcome):
+            rows.setdefault((outcome.log, name), scores.issue_s)
     return pa.table(
         {
             "log": pa.array([log for log, _ in rows], pa.string()),
@@ -198,15 +198,15 @@ def _thresholds(outcomes: Sequence[Outcome], place: Int) -> pa.Table:
     before = 0
     for outcome in outcomes:
         runs = len(outcome.runs)
-        for name, appraisal in outcome.appraisals.items():
-            steps, looks = appraisal.steps, appraisal.detections.detection_s.shape[1]
-            times = 1 if appraisal.detections.detection_s.shape[0] == runs else runs
+        for name, scores in outcome.all_scores.items():
+            steps, episodes = scores.steps, scores.detections.detection_s.shape[1]
+            times = 1 if scores.detections.detection_s.shape[0] == runs else runs
             for copy in range(times):  # one run stands for all
-                row.append(before + (steps.run_ix + copy) * looks + steps.look_ix)
+                row.append(before + (steps.run_ix + copy) * episodes + steps.episode_ix)
                 existence.append(steps.existence)
                 detection_s.append(steps.detection_s)
-            before += runs * looks
-            assert (outcome.table["configuration"] == name).sum() == runs * looks
+            before += runs * episodes
+            assert (outcome.table["configuration"] == name).sum() == runs * episodes
     rows = place[np.concatenate(row)]
     order = np.argsort(rows, kind="stable")
     keys = pd.concat([outcome.table[["log", "configuration", "run", "object_id"]] for outcome in outcomes])

@@ -14,16 +14,16 @@ from copem_replay.core.time_chunk import WHOLE
 from copem_replay.core.tracks import Float, Int, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.detection.by_truth_id import detect
-from copem_replay.metrics.detection.conflict import Foreseeing
+from copem_replay.metrics.detection.conflict import ConflictDetector
 from copem_replay.metrics.detections_table import Events, table
 from copem_replay.metrics.line_of_sight import in_sight_s
-from copem_replay.pipeline.chunking import ROWS_A_STRETCH
-from copem_replay.pipeline.conversions import as_belief
+from copem_replay.pipeline.chunking import ROWS_A_CHUNK
+from copem_replay.pipeline.conversions import as_fused_tracks
 from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.presence import Presence
-from copem_replay.pipeline.receiver import Believed, Receivers, World, by_truth, listen, seen_by_all
-from copem_replay.pipeline.scoring import Appraisal, Appraiser, Surroundings
+from copem_replay.pipeline.receiver import ReceiverOutput, Receivers, WorldChunk, by_truth, listen, seen_by_all
+from copem_replay.pipeline.scoring import Scorer, Scores, TruthCache
 
 BLOCK_BYTES = 200_000_000
 """How much a block may hold (chosen)."""
@@ -45,7 +45,7 @@ class Outcome:
     log: str
     runs: Int
     table: pd.DataFrame
-    appraisals: dict[str, Appraisal]
+    all_scores: dict[str, Scores]
     worked_s: float
     accuracy_s: float
 
@@ -53,8 +53,8 @@ class Outcome:
 def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
     """The runs cut into blocks, small enough for memory and enough of them for the workers."""
     states = _needs_all(experiment) or experiment.measure.conflict is not None
-    if len(replay.stretches) > 1:
-        rows = ROWS_A_STRETCH
+    if len(replay.chunks) > 1:
+        rows = ROWS_A_CHUNK
     else:
         found = replay.found(WHOLE) if _needs_all(experiment) else replay.measured
         rows = max(len(found.tracks.frame_ix), 1)
@@ -99,76 +99,80 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence
     measure, began_s = experiment.measure, time.perf_counter()
     sight_s = _in_sight(replay, experiment, presence)
     events = _by_truth_id(replay, experiment, runs, presence, sight_s)
-    appraisals: dict[str, Appraisal] = {}
+    all_scores: dict[str, Scores] = {}
     everything, accuracy_s, lists_s = _needs_all(experiment), 0.0, time.perf_counter()
     if everything or measure.conflict is not None:
         receivers = Receivers(runs, presence.sending)
         judges: dict[str, _Judge] = {}
         for world in replay.worlds(experiment, presence.sending, measured_only=not everything):
-            around = replay.surroundings_of(world.stretch)
-            for name, believed in receivers.believe(world):
+            around = replay.truth_cache_of(world.chunk)
+            for name, output in receivers.receive(world):
                 if name not in judges:
-                    judges[name] = _Judge(replay, experiment, believed, receivers.issue_s(name), len(runs))
-                judges[name].add(around, believed)
+                    judges[name] = _Judge(replay, experiment, output, receivers.issue_s(name), len(runs))
+                judges[name].add(around, output)
         for name, judge in judges.items():
-            appraisal, foreseen_s = judge.result()
-            if appraisal is not None:
-                appraisals[name] = appraisal
+            scores, conflict_known_s = judge.result()
+            if scores is not None:
+                all_scores[name] = scores
                 if name not in events or measure.match.always:
-                    events[name] = Events(judge.units, appraisal.detections, sight_s[name])
-            if foreseen_s is not None:
-                events[name] = replace(events[name], foreseen_s=foreseen_s)
+                    events[name] = Events(judge.units, scores.detections, sight_s[name])
+            if conflict_known_s is not None:
+                events[name] = replace(events[name], conflict_known_s=conflict_known_s)
             accuracy_s += judge.accuracy_s
         if not _matches(experiment) and measure.conflict is None:  # for nothing else
             accuracy_s = time.perf_counter() - lists_s
     ordered = {name: events[name] for name in experiment.configurations}
-    rows = table(replay.scene, replay.truth, experiment, replay.looks, replay.encounters, runs, ordered)
-    return Outcome(replay.scene.log, runs, rows, appraisals, time.perf_counter() - began_s, accuracy_s)
+    rows = table(replay.scene, replay.truth, experiment, replay.episodes, replay.encounters, runs, ordered)
+    return Outcome(replay.scene.log, runs, rows, all_scores, time.perf_counter() - began_s, accuracy_s)
 
 
 class _Judge:
-    """What comes of one configuration's lists, stretch by stretch."""
+    """What comes of one configuration's lists, chunk by chunk."""
 
-    def __init__(self, replay: Replay, experiment: Experiment, first: Believed, issue_s: Float, runs: int) -> None:
+    def __init__(
+        self, replay: Replay, experiment: Experiment, first: ReceiverOutput, issue_s: Float, runs: int
+    ) -> None:
         measure = experiment.measure
         self.units, self._runs = first.heard.units, runs
-        self._appraiser = self._foreseeing = None
+        self._scorer = self._conflicts = None
         if _needs_all(experiment):
-            self._appraiser = Appraiser(replay.surroundings, replay.looks, first, issue_s, measure)
+            self._scorer = Scorer(replay.truth_cache, replay.episodes, first, issue_s, measure)
         if measure.conflict is not None:
-            self._foreseeing = Foreseeing(
+            self._conflicts = ConflictDetector(
                 replay.ego,
-                replay.looks,
+                replay.episodes,
                 measure.conflict,
                 confirm=measure.confirm,
                 count_earlier=measure.count_earlier,
             )
 
-    def add(self, around: Surroundings, believed: Believed) -> None:
-        matches = None if self._appraiser is None else self._appraiser.add(around, believed)
-        if self._foreseeing is None:
+    def add(self, around: TruthCache, output: ReceiverOutput) -> None:
+        matches = None if self._scorer is None else self._scorer.add(around, output)
+        if self._conflicts is None:
             return
-        if believed.belief is not None:
-            self._foreseeing.add(believed.belief)
+        if output.fused_tracks is not None:
+            self._conflicts.add(output.fused_tracks)
         else:  # lists without truth ids: run by run, by what they were matched with
             assert matches is not None
-            for s in range(len(believed.lists.start)):
-                belief = as_belief(believed.lists, s, matches, believed.heard, believed.at.issue_s, believed.at.newest)
-                self._foreseeing.add(belief, s)
-        self._foreseeing.next(believed.at.issue_s)
+            for s in range(len(output.lists.start)):
+                fused_tracks = as_fused_tracks(
+                    output.lists, s, matches, output.heard, output.at.issue_s, output.at.newest
+                )
+                self._conflicts.add(fused_tracks, s)
+        self._conflicts.next(output.at.issue_s)
 
     @property
     def accuracy_s(self) -> float:
         """How long measuring accuracy took."""
-        return 0.0 if self._appraiser is None else self._appraiser.accuracy_s
+        return 0.0 if self._scorer is None else self._scorer.accuracy_s
 
-    def result(self) -> tuple[Appraisal | None, Float | None]:
-        appraisal = None if self._appraiser is None else self._appraiser.result(self._runs)
-        return appraisal, None if self._foreseeing is None else self._foreseeing.result()
+    def result(self) -> tuple[Scores | None, Float | None]:
+        scores = None if self._scorer is None else self._scorer.result(self._runs)
+        return scores, None if self._conflicts is None else self._conflicts.result()
 
 
 def _in_sight(replay: Replay, experiment: Experiment, presence: Presence) -> dict[str, Float]:
-    """By configuration when any of its units first has each look in sight: (S | 1, M)."""
+    """By configuration when any of its units first has each episode in sight: (S | 1, M)."""
     units = replay.expanded.with_(experiment)
     return {
         name: in_sight_s(replay.first_sights_s, units, units.units_of(configuration), presence.listing)
@@ -190,7 +194,7 @@ def _by_truth_id(
         heard = listen(seen, replay.truth, units, name, presence.sending)
         result = detect(
             heard,
-            replay.looks,
+            replay.episodes,
             confirm=experiment.measure.confirm,
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
@@ -202,16 +206,16 @@ def _by_truth_id(
 def _sightings(replay: Replay, experiment: ExpandedExperiment, runs: Int, presence: Presence) -> Tracks:
     """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
     pieces = []
-    for stretch in replay.stretches:
-        found = replay.measured if stretch == WHOLE else replay.found(stretch).of_objects(replay.looks.object_ix)
+    for chunk in replay.chunks:
+        found = replay.measured if chunk == WHOLE else replay.found(chunk).of_objects(replay.episodes.object_ix)
         found = found.listable
         recorded = None
         if replay.recorded is not None:
-            recorded = replay.recorded.captured_between(stretch.from_s, stretch.until_s)
-        world = World(replay.scene, replay.truth, found, recorded, experiment, stretch)
+            recorded = replay.recorded.captured_between(chunk.from_s, chunk.until_s)
+        world = WorldChunk(replay.scene, replay.truth, found, recorded, experiment, chunk)
         seen = seen_by_all(world, runs, states="true", equipped=presence.listing)
-        if stretch == WHOLE:
+        if chunk == WHOLE:
             return seen
-        looked_at = np.isin(seen.row_object_ix, replay.looks.object_ix)
-        pieces.append(seen.take_rows(np.flatnonzero(seen.valid.any(axis=0) & looked_at)))
+        measured = np.isin(seen.row_object_ix, replay.episodes.object_ix)
+        pieces.append(seen.take_rows(np.flatnonzero(seen.valid.any(axis=0) & measured)))
     return spliced(pieces, states=False)[0]

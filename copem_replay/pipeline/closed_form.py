@@ -48,7 +48,7 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
         columns = _columns(replay, experiment, name, distributions(replay, experiment, name))
         if braking is not None:
             columns |= _passing(replay, columns, braking.driver.reaction)
-        parts.append(pd.DataFrame(columns).drop(columns="look"))
+        parts.append(pd.DataFrame(columns).drop(columns="episode"))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -79,8 +79,8 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
 
 
 def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
-    """For each look when it is first known."""
-    units, looks, confirm = replay.expanded.with_(experiment), replay.looks, experiment.measure.confirm
+    """For each episode when it is first known."""
+    units, episodes, confirm = replay.expanded.with_(experiment), replay.episodes, experiment.measure.confirm
     configuration = units.configurations[name]
     heard = listen(replay.measured.tracks, replay.truth, units, name)
     # A model of the user's own may be above 1 by rounding.
@@ -90,13 +90,15 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
     instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
     arrives_s = heard.arrives_s[0, heard.frame_ix]
     by_object = np.argsort(heard.row_object_ix, kind="stable")
-    first, last = (np.searchsorted(heard.row_object_ix[by_object], looks.object_ix, side) for side in ("left", "right"))
+    first, last = (
+        np.searchsorted(heard.row_object_ix[by_object], episodes.object_ix, side) for side in ("left", "right")
+    )
     result = []
-    for m in range(len(looks.object_ix)):
+    for m in range(len(episodes.object_ix)):
         rows = by_object[first[m] : last[m]]
-        counts = arrives_s[rows] <= looks.ended_s[m] + _TOLERANCE_S
+        counts = arrives_s[rows] <= episodes.ended_s[m] + _TOLERANCE_S
         if not experiment.measure.count_earlier:
-            counts &= heard.row_captured_s[rows] >= looks.onset_s[m] - _TOLERANCE_S
+            counts &= heard.row_captured_s[rows] >= episodes.onset_s[m] - _TOLERANCE_S
         rows = rows[counts]
         if instants is None:
             share = replay.expanded.share if configuration.units != TRUTH else np.ones(1)
@@ -137,9 +139,9 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
 
 
 def _columns(replay: Replay, experiment: Experiment, name: str, distributions: list[FirstKnown]) -> dict[str, Any]:
-    """Columns of one configuration: a row per look and instant, and for each look one, without instant, for never."""
-    scene, looks = replay.scene, replay.looks
-    look = np.repeat(np.arange(len(distributions)), [len(of.time_s) + 1 for of in distributions])
+    """Columns of one configuration: a row per episode and instant, and one, without instant, for never."""
+    scene, episodes = replay.scene, replay.episodes
+    episode = np.repeat(np.arange(len(distributions)), [len(of.time_s) + 1 for of in distributions])
 
     def rows(pieces: Iterable[Float]) -> Float:
         return np.concatenate([np.empty(0), *pieces])
@@ -148,26 +150,26 @@ def _columns(replay: Replay, experiment: Experiment, name: str, distributions: l
         return rows(np.append(np.full(len(of.time_s), np.nan), v) for of, v in zip(distributions, values, strict=True))
 
     detection_s = rows(np.append(of.time_s, np.nan) for of in distributions)
-    object_ix = looks.object_ix[look]
+    object_ix = episodes.object_ix[episode]
     distance_m, gap_m = distances(scene, replay.truth, experiment, object_ix, detection_s)
     return {
         "log": scene.log,
         "configuration": name,
-        "look": look,
+        "episode": episode,
         "object_id": np.array(scene.object_ids, dtype=object)[object_ix],
         "object_class": np.array(CLASSES, dtype=object)[scene.object_class[object_ix]],
-        "onset_s": looks.onset_s[look],
+        "onset_s": episodes.onset_s[episode],
         "detection_s": detection_s,
         "probability": rows(np.append(of.probability, np.exp(of.log_never)) for of in distributions),
         "incidence": rows(np.append(np.minimum(np.cumsum(of.probability), 1), np.nan) for of in distributions),
         "miss_log10": of_never(_log10(of.log_never) for of in distributions),
         "miss_per_logit": of_never(of.per_logit for of in distributions),
         "miss_log10_half_odds": of_never(_log10(of.log_never_half) for of in distributions),
-        "time_to_detection_s": detection_s - looks.onset_s[look],
+        "time_to_detection_s": detection_s - episodes.onset_s[episode],
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,
-        "ended_s": looks.ended_s[look],
-        "ended_by": texts_of(looks.ended_by[look]),
+        "ended_s": episodes.ended_s[episode],
+        "ended_by": texts_of(episodes.ended_by[episode]),
     }
 
 
@@ -177,13 +179,13 @@ def _log10(log: float) -> float:
 
 
 def _passing(replay: Replay, columns: Mapping[str, Any], reaction: Reaction) -> dict[str, Any]:
-    """Whether each row's look is in conflict, and the probabilities to pass and to fail if it is detected then."""
-    look = columns["look"]
+    """Whether each row's episode is in conflict, and the probabilities to pass and to fail if it is detected then."""
+    episode = columns["episode"]
     detection_s = columns["detection_s"]
-    known_s = np.where(np.isnan(detection_s), np.inf, np.maximum(detection_s, replay.looks.onset_s[look]))
-    passes, fails = np.full(len(look), np.nan), np.full(len(look), np.nan)
+    known_s = np.where(np.isnan(detection_s), np.inf, np.maximum(detection_s, replay.episodes.onset_s[episode]))
+    passes, fails = np.full(len(episode), np.nan), np.full(len(episode), np.nan)
     for number, between in replay.passing_s.items():
-        rows = np.flatnonzero(look == number)
+        rows = np.flatnonzero(episode == number)
         passes[rows] = pass_probability(between, known_s[rows], reaction)
         fails[rows] = fail_probability(between, known_s[rows], reaction)
     return {"conflict": ~np.isnan(passes), "pass_probability": passes, "fail_probability": fails}

@@ -4,29 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
-from copem_replay.core.fused_tracks import Belief
-from copem_replay.core.object_list import COVARIANCES, Lists
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.object_list import COVARIANCES, ObjectLists
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, VALUES, Float, Int, Scene, Tracks
 from copem_replay.fusion.inputs import Claims, gathered
 from copem_replay.metrics.matching import MATCH, Matches
 
 
-def as_lists(belief: Belief, scene: Scene) -> Lists:
-    """What ideal fusion, or the truth itself, believes as lists: of each entry it is sure, and it knows its class.
+def as_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
+    """Fused tracks of ideal fusion, or of the truth itself, as lists: existence is 1 and the class is certain.
 
     Its truth ids are no tracks: it is not it that would confuse two objects.
     """
-    fused = belief.fused
+    fused = fused_tracks.fused
     object_ix = fused.row_object_ix
     likely = np.eye(len(CLASSES))[scene.object_class[object_ix]]
     claims = Claims(np.ones(len(object_ix)), likely, np.full(len(object_ix), -1))
     lists, run, row = gathered(fused, claims, np.zeros(fused.valid.shape), fused.valid)
-    lists.entries["captured_s"] = belief.captured_s[run, row]
-    lists.entries["unit_ix"] = belief.first_unit_ix[run, row]
+    lists.entries["captured_s"] = fused_tracks.captured_s[run, row]
+    lists.entries["unit_ix"] = fused_tracks.first_unit_ix[run, row]
     return lists
 
 
-def as_belief(lists: Lists, run: int, matches: Matches, heard: Tracks, issue_s: Float, newest: Int) -> Belief:
+def as_fused_tracks(
+    lists: ObjectLists, run: int, matches: Matches, heard: Tracks, issue_s: Float, newest: Int
+) -> FusedTracks:
     """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else.
 
     `issue_s (K,)`, `newest (K, U)`: the receiver's instants.
@@ -60,4 +62,4 @@ def as_belief(lists: Lists, run: int, matches: Matches, heard: Tracks, issue_s: 
         **{name: said[name][order][None] for name in (*VALUES, *COVARIANCES)},
     )
     none = np.zeros(len(order) + 1, dtype=np.int64)
-    return Belief(fused, heard, none[:0], none, None, said[order])
+    return FusedTracks(fused, heard, none[:0], none, None, said[order])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.errors import ExperimentError
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.config import Recorded
@@ -117,8 +117,8 @@ class ExpandedExperiment:
         # No list and no instant to go by: the carrier and the unit's name in the experiment are the address.
         units = tuple(dict.fromkeys(self.named))
         which = np.array([units.index(name) for name in self.named])
-        address = Address(units, which, object_words(self.carrier), np.zeros(len(which), dtype=np.int64))
-        return Dice(self.seed, log).bernoulli("carries", address, runs, self.share)
+        random_key = RandomKey(units, which, object_words(self.carrier), np.zeros(len(which), dtype=np.int64))
+        return CounterRng(self.seed, log).bernoulli("carries", random_key, runs, self.share)
 
 
 def expand(experiment: Experiment, scene: Scene) -> ExpandedExperiment:

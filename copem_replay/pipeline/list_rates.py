@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from copem_replay.communication.arrivals import instants
+from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
@@ -24,7 +24,7 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
     rates = {}
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world.truth, world.experiment, name)
-        issue_s = instants(heard, max_age_s=configuration.max_age_s).issue_s
+        issue_s = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s
         issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= world.scene.end_s + _TOLERANCE_S)]
         rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
     return rates

@@ -10,14 +10,14 @@ import numpy as np
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
 from copem_replay.perception.pem.condition import Pem
-from copem_replay.perception.sensor_poses import Poses
+from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import without_points
 
@@ -92,7 +92,7 @@ def could_meet(replay: Replay) -> Bool:
     return np.array(list(met.values()), dtype=bool)
 
 
-def _meets(pem: Pem, scene: Scene, world: Tracks, at: Poses, carrier_ix: int) -> bool:
+def _meets(pem: Pem, scene: Scene, world: Tracks, at: UnitPoses, carrier_ix: int) -> bool:
     """Whether any object of a world is where a condition holds, at a list that the unit makes."""
     there = np.flatnonzero(at.present)
     order, bounds = world.by_frame
@@ -106,11 +106,11 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, at: Poses, carrier_ix: int) ->
         some, frame = some[kept], frame[kept]
         dx_m, dy_m = world.x_m[0, some] - at.x_m[frame], world.y_m[0, some] - at.y_m[frame]
         bearing_rad, none = np.arctan2(dy_m, dx_m), np.zeros(len(some))
-        look = Look(
+        view = ViewGeometry(
             np.hypot(dx_m, dy_m), wrap(bearing_rad - at.heading_rad[frame]), bearing_rad, none,
             scene.object_class[world.row_object_ix[some]], none, none, none, none, none,
         )  # fmt: skip
-        if any(bool(condition.holds(look).any()) for condition in anyhow):
+        if any(bool(condition.holds(view).any()) for condition in anyhow):
             return True
     return False
 
@@ -159,7 +159,7 @@ def _on(which: list[str], members: list[str]) -> str:
 
 def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
     """Why there are no rows, or no verdicts."""
-    scene, measure, looks = replay.scene, experiment.measure, replay.looks
+    scene, measure, episodes = replay.scene, experiment.measure, replay.episodes
     if not len(measured_objects(scene, measure)):
         others = np.arange(len(scene.object_class)) != scene.ego_ix
         there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["nobody"]
@@ -168,9 +168,9 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
         yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}"
     elif (instant_s := measure.onset.instant_s) is not None and instant_s > scene.end_s:
         yield f"no rows: the onset at {instant_s:g} s lies after the log's end, {scene.end_s:g} s"
-    elif not len(looks.object_ix):
+    elif not len(episodes.object_ix):
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
-    if experiment.braking is not None and len(looks.object_ix) and not replay.encounters:
+    if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:
         recorded = experiment.braking.ego == "recorded"
         yield (
             f"no verdict: the ego, not braking ({'as recorded' if recorded else 'at constant speed'}), stays more than "

@@ -10,22 +10,22 @@ import numpy as np
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import at_instants
-from copem_replay.core.time_chunk import WHOLE, Stretch
+from copem_replay.core.time_chunk import WHOLE, TimeChunk
 from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recorded_units import RecordedUnits, recorded_units
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.braking.ego_path import EgoCourse
+from copem_replay.metrics.braking.ego_path import EgoPath
 from copem_replay.metrics.braking.encounter import Encounter, encounters
 from copem_replay.metrics.braking.verdict import passing
-from copem_replay.metrics.episodes import Looks, looks
+from copem_replay.metrics.episodes import Episodes, episodes
 from copem_replay.metrics.line_of_sight import first_sights
-from copem_replay.perception.observation import Candidates, KeptShares, candidates, joined_stretches
-from copem_replay.perception.sensor_poses import Placed, place
-from copem_replay.pipeline.chunking import Reach, stretches
+from copem_replay.perception.observation import KeptShares, Observations, joined_chunks, observations
+from copem_replay.perception.sensor_poses import SensorPoses, place
+from copem_replay.pipeline.chunking import Reach, time_chunks
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand
-from copem_replay.pipeline.receiver import World, listen, seen_by_all
-from copem_replay.pipeline.scoring import Surroundings
+from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
+from copem_replay.pipeline.scoring import TruthCache
 
 
 @dataclass(frozen=True)
@@ -35,29 +35,29 @@ class Replay:
     scene: Scene
     expanded: ExpandedExperiment  # the experiment's units over this log
     truth: Tracks  # the world at its own frames, short gaps filled
-    placed: Placed
-    stretches: tuple[Stretch, ...]
+    placed: SensorPoses
+    chunks: tuple[TimeChunk, ...]
     recorded: RecordedUnits | None
-    looks: Looks
+    episodes: Episodes
     encounters: tuple[Encounter, ...]  # those in conflict
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
 
     @cached_property
-    def ego(self) -> EgoCourse:
+    def ego(self) -> EgoPath:
         """How the ego drives through the log. There has to be one."""
-        return EgoCourse(self.scene, self.truth, self.expanded.max_gap_s)
+        return EgoPath(self.scene, self.truth, self.expanded.max_gap_s)
 
     @cached_property
     def passing_s(self) -> dict[int, Float]:
-        """For each look in conflict the beginnings of braking (K, 2), from and to, with which the ego passes."""
+        """For each episode in conflict the beginnings of braking (K, 2), from and to, with which the ego passes."""
         braking = self.expanded.braking
         if braking is None:
             return {}
-        return {each.look_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
+        return {each.episode_ix: passing(each, braking.driver, braking.margin_m) for each in self.encounters}
 
     @property
     def first_sights_s(self) -> Float:
-        """(U, M) when each modelled unit first has each look in sight; inf: never."""
+        """(U, M) when each modelled unit first has each episode in sight; inf: never."""
         return self._overview[0]
 
     @property
@@ -69,91 +69,93 @@ class Replay:
     def _overview(self) -> tuple[Float, Bool]:
         sights: list[Float] = []
         met: list[Bool] = []
-        for stretch in self.stretches:
-            found = self.found(stretch)
-            sights.append(first_sights(found, self.looks))
+        for chunk in self.chunks:
+            found = self.found(chunk)
+            sights.append(first_sights(found, self.episodes))
             met.append(found.ever_met)
         return np.min(sights, axis=0), np.any(met, axis=0)
 
     @cached_property
-    def surroundings(self) -> Surroundings:
+    def truth_cache(self) -> TruthCache:
         """The truth at the instants of fused lists, each computed once."""
-        return Surroundings(self.scene, self.truth, self.expanded)
+        return TruthCache(self.scene, self.truth, self.expanded)
 
-    def surroundings_of(self, stretch: Stretch) -> Surroundings:
+    def truth_cache_of(self, chunk: TimeChunk) -> TruthCache:
         """The truth that configurations share: of a whole log it is kept, of a part of one it is made anew."""
-        if stretch == WHOLE:
-            return self.surroundings
-        return Surroundings(self.scene, self.truth, self.expanded)
+        if chunk == WHOLE:
+            return self.truth_cache
+        return TruthCache(self.scene, self.truth, self.expanded)
 
     @cached_property
     def _shares(self) -> KeptShares:
         return KeptShares()
 
     @cached_property
-    def _whole(self) -> Candidates:
-        return candidates(self.scene, self.truth, self.expanded, self.placed)
+    def _whole(self) -> Observations:
+        return observations(self.scene, self.truth, self.expanded, self.placed)
 
     @cached_property
-    def measured(self) -> Candidates:
+    def measured(self) -> Observations:
         """The rows of objects that are looked at."""
-        return self.rows_of(self.looks.object_ix)
+        return self.rows_of(self.episodes.object_ix)
 
-    def rows_of(self, object_ix: Int) -> Candidates:
-        """The candidate rows of some objects."""
-        return joined_stretches([self.found(stretch).of_objects(object_ix) for stretch in self.stretches])
+    def rows_of(self, object_ix: Int) -> Observations:
+        """The observation rows of some objects."""
+        return joined_chunks([self.found(chunk).of_objects(object_ix) for chunk in self.chunks])
 
-    def found(self, stretch: Stretch, from_s: float | None = None) -> Candidates:
-        """The candidate rows captured in a stretch, or since an earlier instant. Those of a whole log are kept."""
-        if stretch == WHOLE:
+    def found(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
+        """The observation rows captured in a time chunk, or since an earlier instant. Those of a whole log are kept."""
+        if chunk == WHOLE:
             return self._whole
-        return candidates(
+        return observations(
             self.scene,
             self.truth,
             self.expanded,
             self.placed,
-            from_s=stretch.from_s if from_s is None else from_s,
-            until_s=stretch.until_s,
+            from_s=chunk.from_s if from_s is None else from_s,
+            until_s=chunk.until_s,
             kept=self._shares,
-            cut_s=stretch.from_s,
+            cut_s=chunk.from_s,
         )
 
-    def world(self, experiment: Experiment) -> World:
+    def world(self, experiment: Experiment) -> WorldChunk:
         """The log as the units of an experiment have it, by configuration."""
         units = self.expanded.with_(experiment)
-        return World(self.scene, self.truth, self._whole.listable, self.recorded, units)
+        return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units)
 
-    def worlds(self, experiment: Experiment, sending: Bool | None, *, measured_only: bool = False) -> Iterator[World]:
-        """The same stretch by stretch, all of it or what is looked at.
+    def worlds(
+        self, experiment: Experiment, sending: Bool | None, *, measured_only: bool = False
+    ) -> Iterator[WorldChunk]:
+        """The same chunk by chunk, all of it or what is looked at.
 
         `sending (U,)`: the units whose lists the receivers hear, None: all.
         """
-        if self.stretches == (WHOLE,):
+        if self.chunks == (WHOLE,):
             whole = self.world(experiment)
             yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment)
         units, seen = lists.experiment, seen_by_all(lists, np.arange(1), states="true")
         reach = Reach(units, {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations})
-        for stretch in self.stretches:
-            earliest_s = reach.earliest_s(stretch)
-            found = self.found(stretch, earliest_s).listable
-            yield World(
+        for chunk in self.chunks:
+            earliest_s = reach.earliest_s(chunk)
+            found = self.found(chunk, earliest_s).listable
+            yield WorldChunk(
                 self.scene,
-                self.truth.captured_between(earliest_s, stretch.until_s),
-                found.of_objects(self.looks.object_ix) if measured_only else found,
-                None if self.recorded is None else self.recorded.captured_between(earliest_s, stretch.until_s),
+                self.truth.captured_between(earliest_s, chunk.until_s),
+                found.of_objects(self.episodes.object_ix) if measured_only else found,
+                None if self.recorded is None else self.recorded.captured_between(earliest_s, chunk.until_s),
                 units,
-                stretch,
+                chunk,
             )
 
-    def lists_only(self, experiment: Experiment) -> World:
+    def lists_only(self, experiment: Experiment) -> WorldChunk:
         """The same without what is in the lists."""
         none = np.empty(0, dtype=np.int64)
-        found = candidates(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
+        found = observations(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
         recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
         units = self.expanded.with_(experiment)
-        return World(self.scene, self.truth.take_rows(none), found, recorded, units)
+        return WorldChunk(self.scene, self.truth.take_rows(none), found, recorded, units)
 
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
@@ -172,7 +174,7 @@ def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experime
     recorded = recorded_units(
         recording.lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
-    on = looks(scene, truth, placed.static, onsets_of or experiment)
+    on = episodes(scene, truth, placed.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)
-    cut = stretches(scene, truth, expanded)
+    cut = time_chunks(scene, truth, expanded)
     return Replay(scene, expanded, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries)

@@ -1,4 +1,4 @@
-"""Believe: what the receiver makes of what it hears, configuration by configuration (f of the paper's coPEM)."""
+"""The receiver: what it makes of the lists that arrive, configuration by configuration (f of the paper's coPEM)."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from copem_replay.communication.arrivals import Instants, instants
+from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.link import transmit
-from copem_replay.core.fused_tracks import Belief
-from copem_replay.core.object_list import Lists, TellsOf
-from copem_replay.core.random import Address, Dice, object_words
-from copem_replay.core.time_chunk import WHOLE, Stretch
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.object_list import ObjectLists, TellsOf
+from copem_replay.core.random import CounterRng, RandomKey, object_words
+from copem_replay.core.time_chunk import WHOLE, TimeChunk
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
-from copem_replay.fusion.inputs import Claims, lists_without_truth, reports
-from copem_replay.perception.observation import Candidates
+from copem_replay.fusion.inputs import Claims, inputs, lists_without_truth
+from copem_replay.perception.observation import Observations
 from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
@@ -32,48 +32,48 @@ States = Literal["true", "expected", "sampled"]
 
 
 @dataclass(frozen=True)
-class World:
-    """One log, or a stretch of one, as the units of an experiment have it: what of it is the same in all runs.
+class WorldChunk:
+    """One log, or a time chunk of one, as the units of an experiment have it: what of it is the same in all runs.
 
     `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
-    unit per carrier. What was captured before the stretch and is needed in it is there, too.
+    unit per carrier. What was captured before the time chunk and is needed in it is there, too.
     """
 
     scene: Scene
     truth: Tracks
-    found: Candidates
+    found: Observations
     recorded: RecordedUnits | None
     experiment: ExpandedExperiment
-    stretch: Stretch = WHOLE
+    chunk: TimeChunk = WHOLE
 
 
 @dataclass(frozen=True)
-class Believed:
-    """What one configuration's receiver believes in the runs (S,) at its instants, `at`.
+class ReceiverOutput:
+    """What one configuration's receiver issues in the runs (S,) at its instants, `at`.
 
-    `belief`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without truth ids,
-    or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell; `whole`: the
-    instants are all there are, not those of a stretch.
+    `fused_tracks`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without
+    truth ids, or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell;
+    `whole`: the instants are those of the whole log, not of a time chunk.
     """
 
     heard: Tracks
-    at: Instants
-    belief: Belief | None
+    at: FusionSchedule
+    fused_tracks: FusedTracks | None
     scene: Scene
-    fused: Lists | None
+    fused: ObjectLists | None
     tells_of: TellsOf = "capture"
     whole: bool = True
 
     @cached_property
-    def lists(self) -> Lists:
+    def lists(self) -> ObjectLists:
         """The fused lists without truth ids."""
         if self.fused is not None:
             return self.fused
-        assert self.belief is not None
-        return as_lists(self.belief, self.scene)
+        assert self.fused_tracks is not None
+        return as_lists(self.fused_tracks, self.scene)
 
 
-def seen_by_all(world: World, runs: Int, *, states: States, equipped: Bool | None = None) -> Tracks:
+def seen_by_all(world: WorldChunk, runs: Int, *, states: States, equipped: Bool | None = None) -> Tracks:
     """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`."""
     experiment = world.experiment
     if equipped is not None:
@@ -107,33 +107,33 @@ def listen(seen: Tracks, truth: Tracks, experiment: ExpandedExperiment, name: st
 
 
 def by_truth(configuration: Configuration) -> bool:
-    """Whether what a configuration believes has truth ids: the truth itself, and ideal fusion."""
+    """Whether a configuration's fused tracks have truth ids: the truth itself, and ideal fusion."""
     return configuration.units == TRUTH or isinstance(configuration.fusion, Ideal)
 
 
 class Receivers:
     """The receivers of all configurations, of the units that are `there (U,)`, and what they remember.
 
-    Stretches of one log are believed one after the other, in order of time.
+    Time chunks of one log are received one after the other, in order of time.
     """
 
     def __init__(self, runs: Int, there: Bool | None) -> None:
         self._runs, self._there = runs, there
-        self._instants: dict[str, Instants] = {}
+        self._schedules: dict[str, FusionSchedule] = {}
         self._memory: dict[str, Any] = {}
 
     def issue_s(self, name: str) -> Float:
         """(K,) all instants of a configuration's receiver, when it has been heard of."""
-        return self._instants[name].issue_s
+        return self._schedules[name].issue_s
 
-    def believe(self, world: World) -> Iterator[tuple[str, Believed]]:
-        """What each configuration's receiver believes in the runs (S,), in the stretch.
+    def receive(self, world: WorldChunk) -> Iterator[tuple[str, ReceiverOutput]]:
+        """What each configuration's receiver issues in the runs (S,), in the time chunk.
 
         Raises InputError where a fusion of the user's own fails.
         """
         experiment = world.experiment
         seen: dict[States, Tracks] = {}  # each is made when first needed
-        without_truth: list[Lists] = []
+        without_truth: list[ObjectLists] = []
 
         def seen_in(states: States) -> Tracks:
             if states not in seen:
@@ -146,47 +146,47 @@ class Receivers:
             posterior = isinstance(fusion, Ideal) and fusion.combine == "posterior" and not of_truth
             states: States = "expected" if posterior else "sampled"
             heard = listen(seen_in(states), world.truth, experiment, name, self._there)
-            if name not in self._instants:
-                self._instants[name] = instants(heard, max_age_s=max_age_s)
-            at = self._instants[name].between(world.stretch.from_s, world.stretch.until_s)
-            whole = world.stretch == WHOLE
+            if name not in self._schedules:
+                self._schedules[name] = fusion_schedule(heard, max_age_s=max_age_s)
+            at = self._schedules[name].between(world.chunk.from_s, world.chunk.until_s)
+            whole = world.chunk == WHOLE
             if isinstance(fusion, ListFusion):
                 if not without_truth:
                     without_truth.append(_without_truth(world, seen_in("sampled"), self._runs))
-                told = reports(heard, without_truth[0], max_age_s=max_age_s, at=at)
+                told = inputs(heard, without_truth[0], max_age_s=max_age_s, at=at)
                 where = f"configurations.{name}.fusion"
                 if fusion.resumable:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
-                else:  # such a log is one stretch
+                else:  # such a log is one time chunk
                     fused = fused_by(fusion, told, where)
-                yield name, Believed(heard, at, None, world.scene, fused, fusion.tells_of, whole)
+                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole)
                 continue
-            belief = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
+            fused_tracks = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
             if not of_truth and world.recorded is None:
-                belief = replace(belief, look=world.found.look)
+                fused_tracks = replace(fused_tracks, view=world.found.view)
             if posterior:
-                belief = draw_posterior(belief, world.scene, experiment.seed, self._runs)
-            yield name, Believed(heard, at, belief, world.scene, None, whole=whole)
+                fused_tracks = draw_posterior(fused_tracks, world.scene, experiment.seed, self._runs)
+            yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole)
 
 
-def believe(world: World, runs: Int, there: Bool | None) -> Iterator[tuple[str, Believed]]:
-    """What each configuration's receiver believes of a whole log."""
-    return Receivers(runs, there).believe(world)
+def receive(world: WorldChunk, runs: Int, there: Bool | None) -> Iterator[tuple[str, ReceiverOutput]]:
+    """What each configuration's receiver issues in a whole log."""
+    return Receivers(runs, there).receive(world)
 
 
-def _without_truth(world: World, seen: Tracks, runs: Int) -> Lists:
+def _without_truth(world: WorldChunk, seen: Tracks, runs: Int) -> ObjectLists:
     """The units' lists as a real fusion sees them: no truth ids, and in no order that means anything."""
     found, recorded = world.found, world.recorded
     words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]
     existence = found.existence
-    likely = np.eye(len(CLASSES))[found.look.class_ix]
+    likely = np.eye(len(CLASSES))[found.view.class_ix]
     track_id = np.full(len(words), -1)
     if recorded is not None:
         words = np.concatenate([words, np.arange(len(recorded.existence), dtype=np.uint64)])
         existence = np.concatenate([existence, recorded.existence])
         likely = np.concatenate([likely, recorded.class_probability])
         track_id = np.concatenate([track_id, recorded.track_id])
-    address = Address(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
-    drawn = Dice(world.experiment.seed, world.scene.log).uniform("order in the list", address, runs)
+    random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
+    drawn = CounterRng(world.experiment.seed, world.scene.log).uniform("order in the list", random_key, runs)
     claims = Claims(existence, likely, track_id)
     return lists_without_truth(seen, claims, drawn, without_object_ix=world.scene.ego_ix)

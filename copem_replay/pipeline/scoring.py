@@ -15,21 +15,21 @@ import numpy as np
 from copem_replay.core.agree import AGREE
 from copem_replay.core.interpolation import AROUND_S, at_instants
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
-from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_runs
 from copem_replay.metrics.config import Measure, MetricsSetup
 from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
 from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import Looks, measured_objects
+from copem_replay.metrics.episodes import Episodes, measured_objects
 from copem_replay.metrics.matching import Matches, match, match_both
 from copem_replay.metrics.reference import Reference, reference_at
 
 if TYPE_CHECKING:
-    from copem_replay.pipeline.receiver import Believed
+    from copem_replay.pipeline.receiver import ReceiverOutput
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class TruthCache:
     """One log's truth at the instants of fused lists. What configurations share is computed once."""
 
     scene: Scene
@@ -68,16 +68,16 @@ class Surroundings:
         alike[CLASSES.index("other")] = measured[CLASSES.index("other")]
         return alike
 
-    def since_s(self, looks: Looks) -> Float:
+    def since_s(self, episodes: Episodes) -> Float:
         """(M,) when each object that is looked at first is in the log."""
         first = np.full(len(self.scene.object_ids), np.inf)
         np.minimum.at(first, self.truth.row_object_ix, self.truth.row_captured_s)
-        since: Float = first[looks.object_ix]
+        since: Float = first[episodes.object_ix]
         return since
 
 
 @dataclass(frozen=True)
-class Appraisal:
+class Scores:
     """Of one configuration in the runs (S,), or in the one that stands for all.
 
     `issue_s (K,)`: when each list was available. `detections` and `steps`: as matches tell, whatever the fusion.
@@ -89,73 +89,73 @@ class Appraisal:
     accuracy: Accuracy | None
 
 
-def match_lists(around: Surroundings, believed: Believed, measure: Measure) -> Matches:
+def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
     """Which true object each entry of the fused lists is about, at the instant it tells of."""
-    world = around.at(believed.at.issue_s if believed.tells_of == "now" else _captures(believed))
-    return match(believed.lists, world, around.scene, gate_m=measure.match.gate_m, tells_of=believed.tells_of)
+    world = around.at(output.at.issue_s if output.tells_of == "now" else _captures(output))
+    return match(output.lists, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
 
 
-def _match_both(around: Surroundings, believed: Believed, measure: Measure) -> tuple[Matches, Matches]:
+def _match_both(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
     """The same, and if all entries told of the instant their list is available."""
-    if believed.tells_of == "now":
-        matches = match_lists(around, believed, measure)
+    if output.tells_of == "now":
+        matches = match_lists(around, output, measure)
         return matches, matches
-    then, now = around.at(_captures(believed)), around.at(believed.at.issue_s)
-    return match_both(believed.lists, then, now, around.scene, gate_m=measure.match.gate_m)
+    then, now = around.at(_captures(output)), around.at(output.at.issue_s)
+    return match_both(output.lists, then, now, around.scene, gate_m=measure.match.gate_m)
 
 
-def _captures(believed: Believed) -> Float:
+def _captures(output: ReceiverOutput) -> Float:
     """Captures, ascending: all that the entries name, at least; of a log in one piece all that were heard."""
-    captures: Float = np.unique(believed.heard.captured_s)
-    if believed.whole:
+    captures: Float = np.unique(output.heard.captured_s)
+    if output.whole:
         return captures
     # Those next to what is named, before and after.
-    after = np.searchsorted(captures, believed.lists.entries["captured_s"])
+    after = np.searchsorted(captures, output.lists.entries["captured_s"])
     used = np.zeros(len(captures) + 1, dtype=bool)
     used[after] = used[np.maximum(after - 1, 0)] = True
     return captures[used[:-1]]
 
 
-class Appraiser:
-    """Measures a configuration's lists, stretch by stretch; `issue_s (K,)`: when all of the log's are available."""
+class Scorer:
+    """Measures a configuration's lists, chunk by chunk; `issue_s (K,)`: when all of the log's are available."""
 
     def __init__(
-        self, around: Surroundings, looks: Looks, believed: Believed, issue_s: Float, measure: Measure
+        self, around: TruthCache, episodes: Episodes, output: ReceiverOutput, issue_s: Float, measure: Measure
     ) -> None:
         self._issue_s, self._measure = issue_s, measure
         self.accuracy_s = 0.0
         """How long measuring accuracy took, matching not counted."""
-        runs = len(believed.lists.start)
+        runs = len(output.lists.start)
         self._known = FirstMatches(
-            looks, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
-            captures=captures_of(believed.heard),
+            episodes, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
+            captures=captures_of(output.heard),
         )  # fmt: skip
-        self._assessment = None
+        self._aggregator = None
         if measure.accuracy:
-            self._assessment = Assessment(
-                issue_s, around.scene, looks, around.since_s(looks), around.reference(issue_s),
+            self._aggregator = Aggregator(
+                issue_s, around.scene, episodes, around.since_s(episodes), around.reference(issue_s),
                 around.classes(measure), settings=settings_of(measure, around.scene.end_s), runs=runs,
             )  # fmt: skip
 
-    def add(self, around: Surroundings, believed: Believed) -> Matches:
-        """Take in the lists of a stretch; what they are about."""
-        lists, issue_s = believed.lists, believed.at.issue_s
-        if self._assessment is None:
-            about = match_lists(around, believed, self._measure)
+    def add(self, around: TruthCache, output: ReceiverOutput) -> Matches:
+        """Take in the lists of a time chunk; what they are about."""
+        lists, issue_s = output.lists, output.at.issue_s
+        if self._aggregator is None:
+            about = match_lists(around, output, self._measure)
         else:
             began_s = time.perf_counter()
-            about, now = _match_both(around, believed, self._measure)
-            self._assessment.add(lists, about, now, around.at(issue_s))
+            about, now = _match_both(around, output, self._measure)
+            self._aggregator.add(lists, about, now, around.at(issue_s))
             self.accuracy_s += time.perf_counter() - began_s
         self._known.add(lists, about, issue_s)
         return about
 
-    def result(self, runs: int) -> Appraisal:
+    def result(self, runs: int) -> Scores:
         """All of it, for each of so many runs."""
         detections, steps = self._known.result()
-        assessment = self._assessment
-        accuracy = None if assessment is None else for_runs(assessment.result(), runs)
-        return Appraisal(self._issue_s, detections, steps, accuracy)
+        aggregator = self._aggregator
+        accuracy = None if aggregator is None else for_runs(aggregator.result(), runs)
+        return Scores(self._issue_s, detections, steps, accuracy)
 
 
 DISTANCE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)

@@ -1,4 +1,4 @@
-"""Shown: which runs of which logs are written to MCAP and .rrd, under which names, and what was believed in them."""
+"""Which runs of which logs are written to MCAP and .rrd, under which names, and their fused tracks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pandas as pd
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.expansion import of_run
-from copem_replay.pipeline.one_run import Beliefs
+from copem_replay.pipeline.one_run import RunTracks
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import Result
 
@@ -79,11 +79,11 @@ def shown_logs(experiment: Experiment, result: Result) -> list[str]:
 
 @dataclass(frozen=True)
 class OneRun:
-    """What was believed in one run of one log, and the replay and experiment with the units there were in it."""
+    """The fused tracks of one run of one log, and the replay and experiment with the units there were in it."""
 
     replay: Replay
     experiment: Experiment
-    beliefs: Beliefs
+    run_tracks: RunTracks
 
 
 def one_run(recording: Recording, experiment: Experiment, run: int, replay: Replay | None = None) -> OneRun:
@@ -91,4 +91,4 @@ def one_run(recording: Recording, experiment: Experiment, run: int, replay: Repl
     alone = of_run(experiment, recording.scene, run)
     if replay is None or alone is not experiment:
         replay = prepare(recording, alone, onsets_of=experiment)
-    return OneRun(replay, alone, Beliefs(replay, alone, run))
+    return OneRun(replay, alone, RunTracks(replay, alone, run))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from copem_replay.core.tracks import Float, Int, Tracks
-from copem_replay.perception.observation import Candidates
+from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import carrier
 from copem_replay.pipeline.prepare import Replay
 
@@ -23,7 +23,7 @@ class Curve:
     share: Float
 
 
-def share_curves(replay: Replay, found: Candidates, object_ix: int) -> dict[str, Curve]:
+def share_curves(replay: Replay, found: Observations, object_ix: int) -> dict[str, Curve]:
     """By whom an object is seen, and how much of it; nobody's curve is left out. `found`: its rows, at least."""
     scene, experiment, tracks = replay.scene, replay.expanded, found.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
@@ -31,7 +31,7 @@ def share_curves(replay: Replay, found: Candidates, object_ix: int) -> dict[str,
     own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
     share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
     rows = np.flatnonzero(tracks.row_object_ix == object_ix)
-    share[tracks.frame_ix[rows]] = found.look.visible_share[rows]
+    share[tracks.frame_ix[rows]] = found.view.visible_share[rows]
     # A unit without a list of the object says nothing about it: the best of the others counts.
     return {
         whose: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))

@@ -51,7 +51,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         path,
         recording.path,
         run.one.replay.scene,
-        run.one.beliefs,
+        run.one.run_tracks,
         run.table,
         run.manifest,
         family_of(recording),

@@ -5,14 +5,14 @@
 | `world/truth/boxes`, `paths`, `onsets` | the log; of whom we look at, ways, and places at their onsets |
 | `world/truth/lanes` | boundaries of lanes, where the log has them |
 | `world/static`, `world/units/<unit>`, `world/fields/<unit>` | obstacles, units, and the fields of view of their PEMs |
-| `world/<configuration>/boxes`, `covariance` | what the receiver believes, paler the older; 2σ of where |
+| `world/<configuration>/boxes`, `covariance` | the receiver's fused tracks, paler the older; 2σ of where |
 | `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; who listed it |
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where it was first known, and from how far away |
 | `world/eye` | what the eye follows |
 | `lanes/<object>` | how far it has come (`viewer/status.py`): a lane per configuration, and one since the onset |
 | `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
 | `plots/visible_share/<object>/mark 1`, … | onset and detections on these curves |
-| `plots/position_error/<object>/<configuration>` | believed to true position at the instant the list is available |
+| `plots/position_error/<object>/<configuration>` | fused to true position at the instant the list is available |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/differences.py`) |
 | `events/onsets`, `events/<configuration>`, `difference`, `summary`, `legend` | in words |

@@ -1,4 +1,4 @@
-"""What stands in the world: the log's boxes and paths, obstacles, what a configuration believes."""
+"""What stands in the world: the log's boxes and paths, obstacles, a configuration's fused tracks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from copem_replay.core.colours import Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Float, Int, Scene, Tracks
 from copem_replay.perception.visibility import Statics
 from copem_replay.viewer.sink import Out, f32, object_labels, slices, upright
@@ -115,13 +115,13 @@ def lane_boundaries(out: Out, lines: Sequence[Float]) -> None:
         out.static(["world", "truth", "lanes"], rr.LineStrips3D(strips, colors=[LANE], radii=0.05))
 
 
-def believed(out: Out, path: list[str], scene: Scene, belief: Belief, colour: Rgb) -> None:
+def fused_boxes(out: Out, path: list[str], scene: Scene, fused_tracks: FusedTracks, colour: Rgb) -> None:
     """Boxes and ellipses of a configuration's lists, paler the older what they show."""
     import rerun as rr
 
-    tracks, captured_s = belief.fused, belief.captured_s[0]
+    tracks, captured_s = fused_tracks.fused, fused_tracks.captured_s[0]
     object_ix = tracks.row_object_ix
-    kind = _kind(np.where(object_ix >= 0, object_ix, len(scene.object_ids) + belief.class_of(scene)))
+    kind = _kind(np.where(object_ix >= 0, object_ix, len(scene.object_ids) + fused_tracks.class_of(scene)))
     shades = np.array([_rgba((*colour, alpha)) for alpha in ALPHAS], dtype=np.uint32)
 
     def more(rows: Int) -> dict[str, Any]:

@@ -44,9 +44,9 @@ def eye_on(replay: Replay, experiment: Experiment, table: pd.DataFrame, wide: fl
     `wide`: how much wider a view is than high.
     """
     truth, scene, unit = replay.truth, replay.scene, _followed(replay.scene, experiment)
-    looks = table.drop_duplicates("object_id")
-    onset_s = looks["onset_s"].to_numpy(dtype=float)
-    at = _states(replay, experiment, looks["object_id"].map(scene.object_number).to_numpy(dtype=np.int64), onset_s)
+    episodes = table.drop_duplicates("object_id")
+    onset_s = episodes["onset_s"].to_numpy(dtype=float)
+    at = _states(replay, experiment, episodes["object_id"].map(scene.object_number).to_numpy(dtype=np.int64), onset_s)
     there = ~np.isnan(at[0])
     place, onset_s = at[:3, there], onset_s[there]
     on = carrier(scene, experiment.units[unit]) if unit is not None else -1
@@ -64,7 +64,7 @@ def eye_on(replay: Replay, experiment: Experiment, table: pd.DataFrame, wide: fl
             target, towards = own[:3, first] + middle, _ahead(yaw_rad)
             eye = target - _distance(seen, towards, FOLLOWING_M, wide) * towards
             return Eye(np.round(eye, 1), np.round(target, 1), unit, ahead_m)
-    whose = looks["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
+    whose = episodes["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
     rows = np.flatnonzero(np.isin(truth.row_object_ix, whose if len(whose) else truth.object_ix))
     place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
     named = experiment.units.get(experiment.measure.distance_to)

@@ -1,4 +1,4 @@
-"""Curves over time: how much of an object is seen, how far off it is believed, how many are known."""
+"""Curves over time: how much of an object is seen, how far off its fused position is, how many are known."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from copem_replay.core.colours import TRUTH, Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import AROUND_S, at_instants, states_at
 from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
@@ -43,7 +43,7 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
 def position_errors(
     out: Out, replay: Replay, experiment: Experiment, name: str, fused: Tracks, shown: Sequence[int], colour: Rgb
 ) -> None:
-    """Distance from believed to true position of the shown objects, list by list."""
+    """Distance from fused to true position of the shown objects, list by list."""
     import rerun as rr
 
     # Points, as an error belongs to one list and to no time between two; no row where there is nothing to measure.
@@ -70,7 +70,7 @@ def known(
     """
     import rerun as rr
 
-    kept = tracks.valid[0] & np.isin(tracks.row_object_ix, replay.looks.object_ix)
+    kept = tracks.valid[0] & np.isin(tracks.row_object_ix, replay.episodes.object_ix)
     if since_ns is not None:
         kept &= elapsed_ns(tracks)[tracks.frame_ix] >= since_ns[tracks.row_object_ix]
     _, counts = by_frame(tracks, kept)
@@ -83,16 +83,16 @@ def known(
     out.static(path, rr.SeriesLines(names=name, colors=colours, widths=width, interpolation_mode=until_next))
 
 
-def gospa_of(replay: Replay, experiment: Experiment, belief: Belief) -> tuple[Int, Float]:
+def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) -> tuple[Int, Float]:
     """GOSPA (m) of each list at the instant it is available: when (K,), and how much (K,).
 
     Of the measured objects that are in the log then against the entries that are about one of them, and the ghosts of
     their classes; cut-off and power as in `measure`.
     """
-    scene, fused, measure = replay.scene, belief.fused, experiment.measure
+    scene, fused, measure = replay.scene, fused_tracks.fused, experiment.measure
     settings = settings_of(measure, scene.end_s)
     measured = np.isin(np.arange(len(scene.object_ids) + 1), measured_objects(scene, measure))  # the last: nobody
-    ghosts = replay.surroundings.classes(measure)[belief.class_of(scene)] & (fused.row_object_ix < 0)
+    ghosts = replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)] & (fused.row_object_ix < 0)
     near_s, gap_s = fused.arrives_s[0], experiment.max_gap_s + AROUND_S
     near = replay.truth if not len(near_s) else replay.truth.captured_between(near_s[0] - gap_s, near_s[-1] + gap_s)
     truth = near.take_tracks(measured[near.object_ix])
@@ -110,11 +110,11 @@ def gospa_of(replay: Replay, experiment: Experiment, belief: Belief) -> tuple[In
     return elapsed, value_m
 
 
-def gospas(out: Out, replay: Replay, experiment: Experiment, name: str, belief: Belief, colour: Rgb) -> None:
+def gospas(out: Out, replay: Replay, experiment: Experiment, name: str, fused_tracks: FusedTracks, colour: Rgb) -> None:
     """The curve of one configuration."""
     import rerun as rr
 
-    elapsed, value_m = gospa_of(replay, experiment, belief)
+    elapsed, value_m = gospa_of(replay, experiment, fused_tracks)
     path = ["plots", "gospa", part_of(name)]
     out.columns(path, elapsed, rr.Scalars.columns(scalars=value_m))
     until_next = rr.components.InterpolationMode.StepAfter

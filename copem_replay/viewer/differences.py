@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from copem_replay.core.colours import Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
@@ -33,14 +33,14 @@ _ABOVE_M, _MARK_POINTS = 4.5, 7
 
 
 def differences(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
+    out: Out, replay: Replay, experiment: Experiment, run_tracks: Mapping[str, FusedTracks], table: pd.DataFrame,
     baseline: str, shown: Sequence[int], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
     """All of it, for every configuration but the baseline."""
-    second = beliefs[baseline].fused
-    for name in beliefs:
+    second = run_tracks[baseline].fused
+    for name in run_tracks:
         if name != baseline:
-            first = beliefs[name].fused
+            first = run_tracks[name].fused
             _who_knows(out, replay, experiment, name, first, baseline, second)
             _errors(out, replay, experiment, name, first, second, shown, colours[name])
             mine, other = (table[table["configuration"] == one] for one in (name, baseline))
@@ -171,13 +171,13 @@ def _together(both: pd.DataFrame) -> pd.Series:
 
 def _told(both: pd.DataFrame, name: str, baseline: str) -> Iterator[tuple[float, str, str]]:
     """When it is settled, how serious, what: a sentence for every object that at least one of the two knew."""
-    for look in both.itertuples():
-        who = f"{look.object_id} {look.object_class}"
-        if look.detected and look.detected_baseline:
-            after_s = look.detection_s - look.detection_s_baseline
+    for episode in both.itertuples():
+        who = f"{episode.object_id} {episode.object_class}"
+        if episode.detected and episode.detected_baseline:
+            after_s = episode.detection_s - episode.detection_s_baseline
             when = f"{abs(after_s):.2f} s {'after' if after_s > 0 else 'before'}"
-            when = "as soon as" if look.together else when
-            yield max(look.detection_s, look.detection_s_baseline), "INFO", f"{name} knew {who} {when} {baseline}"
-        elif look.detected or look.detected_baseline:
-            knew, never = (name, baseline) if look.detected else (baseline, name)
-            yield look.ended_s, "WARN", f"{never} never knew {who}, {knew} did"
+            when = "as soon as" if episode.together else when
+            yield max(episode.detection_s, episode.detection_s_baseline), "INFO", f"{name} knew {who} {when} {baseline}"
+        elif episode.detected or episode.detected_baseline:
+            knew, never = (name, baseline) if episode.detected else (baseline, name)
+            yield episode.ended_s, "WARN", f"{never} never knew {who}, {knew} did"

@@ -54,11 +54,12 @@ def detections(
     part = _of(replay, table, shown)
     part = part[(part["configuration"] == name) & part["detected"]]
     path = ["world", part_of(name), "marks"]
-    reference = replay.surroundings.reference
+    reference = replay.truth_cache.reference
     order = np.argsort(part["detection_s"].to_numpy(), kind="stable")
     part = part.iloc[order]
     told = [
-        _told(look, short_ids(replay.scene)[replay.scene.object_number[look.object_id]]) for look in part.itertuples()
+        _told(episode, short_ids(replay.scene)[replay.scene.object_number[episode.object_id]])
+        for episode in part.itertuples()
     ]
     try:
         at = reference(part["detection_s"].to_numpy(dtype=float))
@@ -100,11 +101,11 @@ def _of(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> pd.DataFra
     return table[table["object_id"].isin([replay.scene.object_ids[k] for k in shown])]
 
 
-def _told(look: Any, name: str) -> str:
-    parts = [f"{name} detected {look.time_to_detection_s:+.2f} s"]
-    if not np.isnan(look.distance_at_detection_m):
-        parts.append(f"{look.distance_at_detection_m:.1f} m")
-    if (verdict := verdict_of(look)) is not None:
+def _told(episode: Any, name: str) -> str:
+    parts = [f"{name} detected {episode.time_to_detection_s:+.2f} s"]
+    if not np.isnan(episode.distance_at_detection_m):
+        parts.append(f"{episode.distance_at_detection_m:.1f} m")
+    if (verdict := verdict_of(episode)) is not None:
         parts.append(verdict)
     return ", ".join(parts)
 
@@ -146,10 +147,10 @@ def on_curves(
 
     if not curves:
         return
-    looks = table[table["object_id"] == name]
-    marks = [(BY_EGO, looks["onset_s"].head(1), ONSET, rr.components.MarkerShape.Diamond)]
+    episodes = table[table["object_id"] == name]
+    marks = [(BY_EGO, episodes["onset_s"].head(1), ONSET, rr.components.MarkerShape.Diamond)]
     for configuration, colour in colours.items():
-        mine = looks[(looks["configuration"] == configuration) & looks["detected"]]
+        mine = episodes[(episodes["configuration"] == configuration) & episodes["detected"]]
         whose = BY_EGO if _only_ego(replay, experiment, configuration) else BY_ANY
         marks.append((whose, mine["detection_s"], colour, rr.components.MarkerShape.Circle))
     rows: list[tuple[int, float, Rgb, Any]] = []

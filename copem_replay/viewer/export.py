@@ -17,7 +17,7 @@ def rrd_to(viewer: str | None) -> Exporter:
             path,
             run.one.replay,
             run.one.experiment,
-            run.one.beliefs,
+            run.one.run_tracks,
             run.table,
             run.summary,
             run.shown.run,

@@ -1,4 +1,4 @@
-"""What is believed of a few objects over all of a log, however long: their rows of every stretch, joined."""
+"""Fused tracks of a few objects over all of a log, however long: their rows of every time chunk, joined."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import Bool, Int, Tracks, spliced
 
 
 @dataclass
 class _Pieces:
-    """Of one configuration, by stretch: rows of units' lists (P,) with their keys, fused rows (R,), what these are of.
+    """Of one configuration, by time chunk: rows of units' lists (P,) with their keys, fused rows (R,), their sources.
 
     `made_of`: keys of the entries of each fused row, `count (R,)` how many there are.
     """
@@ -29,38 +29,38 @@ class _Pieces:
 
 
 class Kept:
-    """Beliefs of some objects only, taken in stretch by stretch, in order of time; values (1, P)."""
+    """Fused tracks of one run, of some objects only, taken in chunk by chunk, in order of time; values (1, P)."""
 
     def __init__(self, object_ix: Sequence[int]) -> None:
         self._object_ix = np.array(object_ix, dtype=np.int64)
         self._pieces: dict[str, _Pieces] = {}
 
-    def add(self, beliefs: Mapping[str, Belief]) -> None:
-        """The next stretch's beliefs, by configuration; they need not be kept otherwise."""
-        for name, belief in beliefs.items():
+    def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
+        """The next time chunk's fused tracks, by configuration; they need not be kept otherwise."""
+        for name, fused_tracks in run_tracks.items():
             pieces = self._pieces.setdefault(name, _Pieces())
-            self._add_heard(pieces, belief.heard)
-            rows = np.flatnonzero(self._wanted(belief.fused))
-            count = np.diff(belief.start)[rows]
+            self._add_heard(pieces, fused_tracks.heard)
+            rows = np.flatnonzero(self._wanted(fused_tracks.fused))
+            count = np.diff(fused_tracks.start)[rows]
             within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-            entries = belief.entries[np.repeat(belief.start[rows], count) + within]
-            pieces.fused.append(belief.fused.take_rows(rows))
-            pieces.made_of.append(self._key(belief.heard)[entries])
+            entries = fused_tracks.entries[np.repeat(fused_tracks.start[rows], count) + within]
+            pieces.fused.append(fused_tracks.fused.take_rows(rows))
+            pieces.made_of.append(self._key(fused_tracks.heard)[entries])
             pieces.count.append(count)
-            if belief.said is not None:
-                pieces.said.append(belief.said[rows])
+            if fused_tracks.said is not None:
+                pieces.said.append(fused_tracks.said[rows])
 
-    def whole(self) -> dict[str, Belief]:
-        """Of all stretches, as of one. How rows look from their units is not kept."""
+    def whole(self) -> dict[str, FusedTracks]:
+        """Of all time chunks, as of one. How rows look from their units is not kept."""
         return {name: _joined(pieces) for name, pieces in self._pieces.items()}
 
     def _add_heard(self, pieces: _Pieces, heard: Tracks) -> None:
-        """Rows that no stretch before has had: what has been captured before a stretch may be in it once more."""
+        """Rows that no time chunk before has had: what has been captured before a time chunk may be in it once more."""
         wanted, key = self._wanted(heard), self._key(heard)
         before = np.concatenate([np.empty(0, dtype=np.int64), *pieces.keys])
         fresh = np.flatnonzero(wanted & ~np.isin(key, before))
         taken = heard.take_rows(fresh)
-        if pieces.heard:  # the lists are those of all the log in every stretch: they are kept once
+        if pieces.heard:  # the lists are those of all the log in every time chunk: they are kept once
             first = pieces.heard[0]
             lists = ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")
             taken = replace(taken, **{column: getattr(first, column) for column in lists})
@@ -76,7 +76,7 @@ class Kept:
         return tracks.row_object_ix * len(tracks.stamp_ns) + tracks.frame_ix
 
 
-def _joined(pieces: _Pieces) -> Belief:
+def _joined(pieces: _Pieces) -> FusedTracks:
     heard, order = spliced(pieces.heard)
     keys = np.concatenate(pieces.keys)[order]
     fused, order = _one_after_another(pieces.fused)
@@ -88,11 +88,11 @@ def _joined(pieces: _Pieces) -> Belief:
     by_key = np.argsort(keys, kind="stable")
     entries = by_key[np.searchsorted(keys[by_key], made_of)]
     said = np.concatenate(pieces.said)[order] if pieces.said else None
-    return Belief(fused, heard, entries, start, said=said)
+    return FusedTracks(fused, heard, entries, start, said=said)
 
 
 def _one_after_another(fused: Sequence[Tracks]) -> tuple[Tracks, Int]:
-    """Lists of stretches as the lists of one, and where its rows come from, as of `spliced`."""
+    """Lists of time chunks as the lists of one, and where its rows come from, as of `spliced`."""
     frames: dict[str, Any] = {
         name: np.concatenate([getattr(piece, name) for piece in fused], axis=-1)
         for name in ("stamp_ns", "captured_s", "frame_unit_ix", "arrives_s")

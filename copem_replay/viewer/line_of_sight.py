@@ -9,12 +9,12 @@ import numpy as np
 
 from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
 from copem_replay.core.tracks import Bool, Float, Int, Tracks
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.pem.condition import Condition, Couple
-from copem_replay.perception.sensor_poses import Poses, carrier, observers, poses, unit_ground
+from copem_replay.perception.sensor_poses import UnitPoses, carrier, observers, poses, unit_ground
 from copem_replay.perception.visibility import hidden_by, visible_shares
-from copem_replay.pipeline.chunking import ROWS_A_STRETCH
+from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.sink import f32
 
@@ -54,8 +54,8 @@ def sight(replay: Replay, experiment: Experiment, shown: Sequence[int]) -> Sight
         place_m=np.full((*shape[:2], 3), np.nan),
     )
     obstacles = _obstacle_centres(replay, experiment)
-    # So many frames at once as have the rows of a stretch: what hides an object is searched among all that is there.
-    at_once = max(1, ROWS_A_STRETCH * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
+    # So many frames at once as have the rows of a time chunk: what hides an object is searched among all that is there.
+    at_once = max(1, ROWS_A_CHUNK * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
     for first in range(0, len(stamps), at_once):
         _look_at(replay, experiment, seen, slice(first, first + at_once), obstacles)
     return seen
@@ -75,11 +75,11 @@ def _look_at(replay: Replay, experiment: Experiment, seen: Sight, part: slice, o
         at = poses(scene, unit, world, unit_ground(truth, name, unit, []))
         watching = observers([at], np.array([carrier(scene, unit)]))
         [share] = visible_shares(world, replay.placed.static, watching, experiment.visibility)
-        look = _look(at, world, rows, scene.object_class[world.row_object_ix[rows]])
+        view = _view(at, world, rows, scene.object_class[world.row_object_ix[rows]])
         pem = experiment.pems[str(unit.pem)]
-        in_field = _anywhere(pem, look, "range_m", "azimuth_deg", "classes")
+        in_field = _anywhere(pem, view, "range_m", "azimuth_deg", "classes")
         seen.place_m[u, part] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
-        seen.in_range[u, frame, column] = _anywhere(pem, look, "range_m")
+        seen.in_range[u, frame, column] = _anywhere(pem, view, "range_m")
         seen.share[u, frame, column] = np.where(in_field, share[rows], np.nan)
         _hidden(replay, experiment, unit, at, seen, u, part, obstacles)
 
@@ -99,7 +99,7 @@ def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
 
 
 def _hidden(
-    replay: Replay, experiment: Experiment, unit: Unit, at: Poses, seen: Sight, u: int, part: slice,
+    replay: Replay, experiment: Experiment, unit: Unit, at: UnitPoses, seen: Sight, u: int, part: slice,
     obstacles: np.ndarray,
 ) -> None:  # fmt: skip
     """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`.
@@ -111,7 +111,7 @@ def _hidden(
         return
     frames = part.start + within
     world = _world(replay, experiment, seen.elapsed_ns[frames])
-    then = Poses(*(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
+    then = UnitPoses(*(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
     watching = observers([then], np.array([carrier(replay.scene, unit)]))
     [hides] = hidden_by(world, replay.placed.static, watching, experiment.visibility)
     rows, column = _rows(world, seen.object_ix.tolist())
@@ -125,28 +125,28 @@ def _hidden(
     seen.body_m[u, frames[world.frame_ix[rows]], column] = where[body]
 
 
-def _look(at: Poses, world: Tracks, rows: Int, class_ix: np.ndarray) -> Look:
+def _view(at: UnitPoses, world: Tracks, rows: Int, class_ix: np.ndarray) -> ViewGeometry:
     """What fields of view ask: range, azimuth and class; of the rest nothing is said."""
     frames = world.frame_ix[rows]
     dx, dy = world.x_m[0, rows] - at.x_m[frames], world.y_m[0, rows] - at.y_m[frames]
     bearing = np.arctan2(dy, dx)
     nothing = np.full(len(dx), np.nan)
-    rest = dict.fromkeys(Look.__dataclass_fields__, nothing)
+    rest = dict.fromkeys(ViewGeometry.__dataclass_fields__, nothing)
     known = {
         "range_m": np.hypot(dx, dy),
         "azimuth_rad": wrap(bearing - at.heading_rad[frames]),
         "bearing_rad": bearing,
         "class_ix": class_ix,
     }
-    return Look(**(rest | known))
+    return ViewGeometry(**(rest | known))
 
 
-def _anywhere(pem: tuple[Couple, ...], look: Look, *keys: str) -> Bool:
+def _anywhere(pem: tuple[Couple, ...], view: ViewGeometry, *keys: str) -> Bool:
     """(P,) where these parts of the condition of some couple hold."""
     conditions = [Condition(**{key: getattr(couple.when, key) for key in keys}) for couple in pem]
     with np.errstate(invalid="ignore"):
-        held: Bool = np.any([condition.holds(look) for condition in conditions], axis=0)
-    return held & ~np.isnan(look.range_m)
+        held: Bool = np.any([condition.holds(view) for condition in conditions], axis=0)
+    return held & ~np.isnan(view.range_m)
 
 
 def _obstacle_centres(replay: Replay, experiment: Experiment) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.colours import Rgb, configuration_colours
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
@@ -44,7 +44,7 @@ def write_rrd(
     path: Path,
     replay: Replay,
     experiment: Experiment,
-    beliefs: Iterable[Mapping[str, Belief]],
+    run_tracks: Iterable[Mapping[str, FusedTracks]],
     table: pd.DataFrame,
     summary: pd.DataFrame,
     run: int,
@@ -55,12 +55,12 @@ def write_rrd(
 ) -> list[str]:
     """Write one run of one log, and send it to a viewer, too. Returns notes for the user. Raises OutputError.
 
-    `beliefs`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a frame per
+    `run_tracks`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a frame per
     list it issued (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`:
     of all logs and runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration
     differences to which are marked.
     """
-    rest = iter(beliefs)
+    rest = iter(run_tracks)
     first = next(rest)
     chosen = viewed(experiment, list(first), baseline)
     left_out = [name for name in first if name not in chosen]
@@ -148,40 +148,40 @@ def _world(
         shares = share_curves(replay, rows, k)
         curves.visible_share(out, scene.object_ids[k], shares)
         event_markers.on_curves(out, replay, experiment, table, scene.object_ids[k], shares, colours)
-    if len(replay.looks.object_ix):
+    if len(replay.episodes.object_ix):
         curves.known(out, replay, "truth", replay.truth)
 
 
 def _knowledge(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
+    out: Out, replay: Replay, experiment: Experiment, run_tracks: Mapping[str, FusedTracks], table: pd.DataFrame,
     shown: Sequence[int], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
-    """Why, and since when. `beliefs`: of the shown objects, over all of the log."""
+    """Why, and since when. `run_tracks`: of the shown objects, over all of the log."""
     seen = sight(replay, experiment, shown)
     made = {}
     for name, colour in colours.items():
         clock = clock_of(replay.scene, table, name)
-        made[name] = status_of(replay, experiment, name, beliefs[name], seen, clock)
+        made[name] = status_of(replay, experiment, name, run_tracks[name], seen, clock)
         status_drawing.words(out, name, replay, experiment, seen, made[name], clock)
         status_drawing.hiding(out, name, seen, made[name])
         asked = experiment.configurations[name]
-        status_drawing.listings(out, name, replay, experiment, asked, beliefs[name], seen, colour)
+        status_drawing.listings(out, name, replay, experiment, asked, run_tracks[name], seen, colour)
     if shown:  # their onsets and ends are the same in all configurations
         status_drawing.lanes(out, replay.scene, seen, made, colours, clock)
 
 
 def _believed(
-    out: Out, replay: Replay, experiment: Experiment, beliefs: Mapping[str, Belief], table: pd.DataFrame,
+    out: Out, replay: Replay, experiment: Experiment, run_tracks: Mapping[str, FusedTracks], table: pd.DataFrame,
     shown: Sequence[int], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
-    """What each configuration knew in a stretch, and how far off that was."""
+    """What each configuration knew in a time chunk, and how far off that was."""
     for name, colour in colours.items():
-        boxes.believed(out, ["world", part_of(name)], replay.scene, beliefs[name], colour)
-        curves.position_errors(out, replay, experiment, name, beliefs[name].fused, shown, colour)
-        if len(replay.looks.object_ix):
-            curves.gospas(out, replay, experiment, name, beliefs[name], colour)
+        boxes.fused_boxes(out, ["world", part_of(name)], replay.scene, run_tracks[name], colour)
+        curves.position_errors(out, replay, experiment, name, run_tracks[name].fused, shown, colour)
+        if len(replay.episodes.object_ix):
+            curves.gospas(out, replay, experiment, name, run_tracks[name], colour)
             since_ns = clock_of(replay.scene, table, name).known_ns
-            curves.known(out, replay, name, beliefs[name].fused, colour, since_ns)
+            curves.known(out, replay, name, run_tracks[name].fused, colour, since_ns)
 
 
 def _properties(

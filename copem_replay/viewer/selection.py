@@ -33,20 +33,20 @@ def viewed(experiment: Experiment, configurations: Sequence[str], baseline: str 
 def telling(table: pd.DataFrame, baselines: Sequence[str], most: int) -> list[str]:
     """Ids of the objects that tell configurations apart: in conflict with the ego, known at different times, late.
 
-    In the table's order. Never known counts as known when the look ended; `baselines` don't count beside others.
+    In the table's order. Never known counts as known when the episode ended; `baselines` don't count beside others.
     """
     others = table[~table["configuration"].isin(baselines)]
-    looks = others if len(others) else table
-    time_s = looks["time_to_detection_s"].fillna(looks["ended_s"] - looks["onset_s"])
-    of_each = time_s.groupby(looks["object_id"], sort=False)
-    conflict = looks["conflict"] if "conflict" in looks else pd.Series(False, index=looks.index)
+    episodes = others if len(others) else table
+    time_s = episodes["time_to_detection_s"].fillna(episodes["ended_s"] - episodes["onset_s"])
+    of_each = time_s.groupby(episodes["object_id"], sort=False)
+    conflict = episodes["conflict"] if "conflict" in episodes else pd.Series(False, index=episodes.index)
     rank = pd.DataFrame(
         {
-            "conflict": conflict.fillna(False).astype(bool).groupby(looks["object_id"], sort=False).any(),
+            "conflict": conflict.fillna(False).astype(bool).groupby(episodes["object_id"], sort=False).any(),
             "apart": of_each.max() - of_each.min(),
             "late": of_each.max(),
         }
     )
-    rank = rank.loc[list(dict.fromkeys(looks["object_id"]))]
+    rank = rank.loc[list(dict.fromkeys(episodes["object_id"]))]
     chosen = set(rank.sort_values(["conflict", "apart", "late"], ascending=False, kind="stable").index[:most])
     return [name for name in dict.fromkeys(table["object_id"]) if name in chosen]

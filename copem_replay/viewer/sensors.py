@@ -9,7 +9,7 @@ from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import Float, Tracks
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.pem.condition import Condition, Couple
-from copem_replay.perception.sensor_poses import Poses, carrier, list_instants, mounting_height, unit_ground
+from copem_replay.perception.sensor_poses import UnitPoses, carrier, list_instants, mounting_height, unit_ground
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.boxes import EGO
 from copem_replay.viewer.sink import Out, f32, upright
@@ -107,7 +107,7 @@ def _outline(when: Condition) -> list[np.ndarray]:
 
 
 def _field(
-    out: Out, name: str, unit: Unit, at: Poses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...], height_m: float
+    out: Out, name: str, unit: Unit, at: UnitPoses, elapsed_ns: np.ndarray, pem: tuple[Couple, ...], height_m: float
 ) -> None:
     """The outlines in the unit's own frame, which moves; on the ground under it."""
     import rerun as rr

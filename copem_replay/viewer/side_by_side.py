@@ -78,13 +78,15 @@ def write_beside(
         if side.one.replay.scene.object_ids != recording.scene.object_ids:
             where = sides[0].results.folder
             raise InputError(f"{side.results.folder}: log {log}: expected the objects of {where}: `read` differs")
-    beliefs = {side.labels[name]: belief for side in sides for name, belief in side.one.beliefs.whole().items()}
+    run_tracks = {
+        side.labels[name]: fused_tracks for side in sides for name, fused_tracks in side.one.run_tracks.whole().items()
+    }
     table = pd.concat([side.rows.assign(configuration=side.rows["configuration"].map(side.labels)) for side in sides])
     write_rrd(
         path,
         prepare(recording, experiment, onsets_of=sides[0].results.experiment),
         experiment,
-        [{one.label: beliefs[one.label] for one in wanted}],
+        [{one.label: run_tracks[one.label] for one in wanted}],
         table.reset_index(drop=True),
         _summary(sides, wanted),
         number,

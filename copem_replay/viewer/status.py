@@ -16,7 +16,7 @@ At an instant, of an object and the units of a configuration, the last of these 
 | unmatched | a unit's newest list that has arrived holds it; of the fused list no entry is matched with it |
 | listed before the onset | the receiver's newest list holds it, as it was before the onset, which does not count |
 | listed, not confirmed | it does, since the onset, or whenever counts; `confirm` asks for more |
-| listed too late | it does, and was not there before the look ended |
+| listed too late | it does, and was not there before the episode ended |
 | known | it does, at or after `detection_s` |
 """
 
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
@@ -58,7 +58,7 @@ class Clock:
 
 
 def clock_of(scene: Scene, table: pd.DataFrame, configuration: str) -> Clock:
-    """When each object's look begins and ends, and when it is known; `table`: rows of one log and run."""
+    """When each object's episode begins and ends, and when it is known; `table`: rows of one log and run."""
     known = table[(table["configuration"] == configuration) & table["detected"]]
     times = (table, "onset_s"), (known, "detection_s"), (table, "ended_s")
     made = []
@@ -79,22 +79,22 @@ class Status:
     unit_ix: Int  # of the experiment: who sees most of it, or whose list is under way
     until_s: Float  # until a list under way arrives
     age_of_information_s: Float  # of what is listed
-    x_m: Float  # where it truly is, or where it is believed to be while absent
+    x_m: Float  # where it truly is, or its fused position while absent
     y_m: Float
     top_m: Float
 
 
 def status_of(
-    replay: Replay, experiment: Experiment, configuration: str, belief: Belief, seen: Sight, clock: Clock
+    replay: Replay, experiment: Experiment, configuration: str, fused_tracks: FusedTracks, seen: Sight, clock: Clock
 ) -> Status:
     """The status of all shown objects at every instant at which any of them may change."""
-    heard, numbers = belief.heard, {name: u for u, name in enumerate(experiment.units)}
+    heard, numbers = fused_tracks.heard, {name: u for u, name in enumerate(experiment.units)}
     asked = experiment.configurations[configuration]
     of_truth = asked.units == TRUTH
     heard_of = [TRUTH] if of_truth else [name for name in experiment.units_of(asked) if name in heard.units]
     modelled = [numbers[name] for name in heard_of if name in experiment.modelled]
     listed = [[_lists(heard, heard.units.index(name), k) for name in heard_of] for k in seen.object_ix]
-    instants = _instants(seen, belief.fused, listed, clock, replay.scene.end_ns - replay.scene.t0_ns)
+    instants = _instants(seen, fused_tracks.fused, listed, clock, replay.scene.end_ns - replay.scene.t0_ns)
     frame = np.searchsorted(seen.elapsed_ns, instants + SAME_INSTANT_NS, side="right") - 1
     shape = (len(instants), len(seen.object_ix))
     made = Status(
@@ -108,14 +108,14 @@ def status_of(
         made.x_m[:, m], made.y_m[:, m], made.top_m[:, m] = at["x_m"], at["y_m"], at["z_m"] + at["height_m"] / 2
         made.status[there, m] = VISIBLE if of_truth else OUT if modelled else UNLISTED
         if modelled and len(instants):
-            _looked_at(seen, modelled, m, there & (frame >= 0), made)
+            _measured(seen, modelled, m, there & (frame >= 0), made)
         for name, (captured_ns, arrives_ns, stamps_ns) in zip(heard_of, listed[m], strict=True):
             _under_way(captured_ns, arrives_ns, stamps_ns, numbers.get(name, -1), m, made)
-        _held(belief, k, m, clock, experiment.measure.count_earlier, made)
+        _held(fused_tracks, k, m, clock, experiment.measure.count_earlier, made)
     return made
 
 
-def _looked_at(seen: Sight, units: list[int], m: int, there: Bool, made: Status) -> None:
+def _measured(seen: Sight, units: list[int], m: int, there: Bool, made: Status) -> None:
     """Who of some units sees most of object m. Out: its column of `made`."""
     share = seen.share[units][:, np.maximum(made.frame, 0), m]
     best = np.argmax(np.nan_to_num(share, nan=-1.0), axis=0)
@@ -183,16 +183,16 @@ def _under_way(captured_ns: Int, arrives_ns: Float, stamps_ns: Int, unit: int, m
         made.status[heard, m], made.unit_ix[heard, m] = UNMATCHED, unit
 
 
-def _held(belief: Belief, object_ix: int, m: int, clock: Clock, count_earlier: bool, made: Status) -> None:
-    """Where the receiver's newest list holds the object, and where it believes it if it is gone. Out: as before."""
-    fused = belief.fused
+def _held(fused_tracks: FusedTracks, object_ix: int, m: int, clock: Clock, count_earlier: bool, made: Status) -> None:
+    """Where the receiver's newest list holds the object, and its fused position if it is gone. Out: as before."""
+    fused = fused_tracks.fused
     row_of = np.full(len(fused.stamp_ns) + 1, -1)  # one more: there was no list yet
     rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
     row_of[fused.frame_ix[rows]] = rows
     row = row_of[np.searchsorted(elapsed_ns(fused), made.elapsed_ns + SAME_INSTANT_NS, side="right") - 1]
     held = np.flatnonzero(row >= 0)
     row = row[held]
-    captured_s = belief.captured_s[0, row]
+    captured_s = fused_tracks.captured_s[0, row]
     made.age_of_information_s[held, m] = made.elapsed_ns[held] * 1e-9 - captured_s
     gone = np.isnan(made.x_m[held, m])  # whatever is under way
     top_m = fused.z_m[0] + fused.height_m[0] / 2

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 import pyarrow as pa
 
-from copem_replay.communication.arrivals import instants
+from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.colours import Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH, Bool, Int, Scene
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.pipeline.prepare import Replay
@@ -140,16 +140,16 @@ def hiding(out: Out, name: str, seen: Sight, made: Status) -> None:
 
 
 def listings(
-    out: Out, name: str, replay: Replay, experiment: Experiment, asked: Configuration, belief: Belief, seen: Sight,
-    colour: Rgb,
+    out: Out, name: str, replay: Replay, experiment: Experiment, asked: Configuration, fused_tracks: FusedTracks,
+    seen: Sight, colour: Rgb,
 ) -> None:  # fmt: skip
     """Lines from each unit, where it was at capture, to where it listed the shown objects."""
     import rerun as rr
 
     if not len(seen.object_ix):
         return
-    heard = belief.heard
-    at = instants(heard, max_age_s=asked.max_age_s)
+    heard = fused_tracks.heard
+    at = fusion_schedule(heard, max_age_s=asked.max_age_s)
     place = unit_places(replay, experiment, heard)
     row_of = np.full((len(heard.stamp_ns) + 1, len(seen.object_ix)), -1)  # one more: no list
     rows = np.flatnonzero(np.isin(heard.row_object_ix, seen.object_ix) & heard.valid[0])

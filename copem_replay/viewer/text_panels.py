@@ -19,48 +19,54 @@ def onsets(out: Out, scene: Scene, table: pd.DataFrame) -> None:
     """When the clock of each object began: the same for all configurations, and said once."""
     import rerun as rr
 
-    looks = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
+    episodes = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
     text = [
-        f"onset of {_who(look, scene)}" + (", already at its first frame" if look.onset_at_start else "")
-        for look in looks.itertuples()
+        f"onset of {_who(episode, scene)}" + (", already at its first frame" if episode.onset_at_start else "")
+        for episode in episodes.itertuples()
     ]
-    out.columns(["events", "onsets"], ns(looks["onset_s"]), rr.TextLog.columns(text=text, level=["INFO"] * len(text)))
+    out.columns(
+        ["events", "onsets"], ns(episodes["onset_s"]), rr.TextLog.columns(text=text, level=["INFO"] * len(text))
+    )
 
 
 def events(out: Out, scene: Scene, name: str, part: pd.DataFrame) -> None:
-    """How each look ended. `part`: the rows of one configuration."""
+    """How each episode ended. `part`: the rows of one configuration."""
     import rerun as rr
 
-    told = sorted((_ending(look, scene) for look in part.itertuples()), key=lambda event: event[0])
+    told = sorted((_ending(episode, scene) for episode in part.itertuples()), key=lambda event: event[0])
     text = [f"{name}: {sentence}" for _, _, sentence in told]
     columns = rr.TextLog.columns(text=text, level=[level for _, level, _ in told])
     out.columns(["events", part_of(name)], ns([time_s for time_s, _, _ in told]), columns)
 
 
-def _who(look: Any, scene: Scene) -> str:
-    return f"{short_ids(scene)[scene.object_number[look.object_id]]} {look.object_class}"
+def _who(episode: Any, scene: Scene) -> str:
+    return f"{short_ids(scene)[scene.object_number[episode.object_id]]} {episode.object_class}"
 
 
-def _ending(look: Any, scene: Scene) -> tuple[float, str, str]:
+def _ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
     """When, how serious, what: of one row of the detections."""
-    who, verdict = _who(look, scene), verdict_of(look)
+    who, verdict = _who(episode, scene), verdict_of(episode)
     then = f"; the ego {verdict}" if verdict else ""
-    if not look.detected:
-        why = EndReason(look.ended_by)
+    if not episode.detected:
+        why = EndReason(episode.ended_by)
         ending = f"undetected when {why.past}" if why.censors else "left undetected"
-        return look.ended_s, "WARN", f"{who} {ending}{then}"
-    late_s, far_m = look.time_to_detection_s, look.distance_at_detection_m
+        return episode.ended_s, "WARN", f"{who} {ending}{then}"
+    late_s, far_m = episode.time_to_detection_s, episode.distance_at_detection_m
     when = f"{abs(late_s):.2f} s {'before' if late_s < 0 else 'after'} the onset"
     where = "" if np.isnan(far_m) else f", at {far_m:.1f} m"
-    passed = verdict is None or look.braking_pass
-    return look.detection_s, "INFO" if passed else "WARN", f"{who} detected by {look.first_unit} {when}{where}{then}"
+    passed = verdict is None or episode.braking_pass
+    return (
+        episode.detection_s,
+        "INFO" if passed else "WARN",
+        f"{who} detected by {episode.first_unit} {when}{where}{then}",
+    )
 
 
-def verdict_of(look: Any) -> str | None:
+def verdict_of(episode: Any) -> str | None:
     """What becomes of a row of the detections that is in conflict: “stops” is to stay clear by braking; else None."""
-    if not getattr(look, "conflict", False):
+    if not getattr(episode, "conflict", False):
         return None
-    return "stays clear" if look.braking_pass else "does not stay clear"
+    return "stays clear" if episode.braking_pass else "does not stay clear"
 
 
 def differences(out: Out, replay: Replay, table: pd.DataFrame, shown: Sequence[int], left_out: Sequence[str]) -> None:
@@ -68,31 +74,30 @@ def differences(out: Out, replay: Replay, table: pd.DataFrame, shown: Sequence[i
     import rerun as rr
 
     of_each = [table[table["object_id"] == replay.scene.object_ids[k]] for k in shown]
-    tables = [_difference(looks, replay.scene) for looks in of_each]
+    tables = [_difference(episodes, replay.scene) for episodes in of_each]
     if len(shown) > 1:
         tables.insert(0, _overview(of_each, replay.scene))
     text = "\n\n".join([*tables, *_left_out(left_out)])
     out.static(["difference"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
-def _difference(looks: pd.DataFrame, scene: Scene) -> str:
-    first = next(looks.itertuples())
+def _difference(episodes: pd.DataFrame, scene: Scene) -> str:
+    first = next(episodes.itertuples())
     braking = bool(getattr(first, "conflict", False))
     head = ["configuration", "known after", "at distance", *(["verdict", "smallest distance"] if braking else []), "by"]
     lines = [f"| {' | '.join(head)} |", "| --- |" + " ---: |" * (len(head) - 1)]
-    for look in looks.itertuples():
+    for episode in episodes.itertuples():
         cells = [
-            f"{look.time_to_detection_s:.2f} s" if look.detected else "never",
-            _metres(look.distance_at_detection_m),
+            f"{episode.time_to_detection_s:.2f} s" if episode.detected else "never",
+            _metres(episode.distance_at_detection_m),
         ]
         if braking:
-            verdict = "pass" if look.braking_pass else "**fail**"
-            if not look.braking_pass and look.impact_speed_mps > 0:
-                verdict += f" at {look.impact_speed_mps:.1f} m/s"
-            cells += [verdict, _metres(look.min_distance_m)]
-        lines.append(
-            f"| {_cell(look.configuration)} | {' | '.join(cells)} | {look.first_unit if look.detected else '–'} |"
-        )
+            verdict = "pass" if episode.braking_pass else "**fail**"
+            if not episode.braking_pass and episode.impact_speed_mps > 0:
+                verdict += f" at {episode.impact_speed_mps:.1f} m/s"
+            cells += [verdict, _metres(episode.min_distance_m)]
+        unit = episode.first_unit if episode.detected else "–"
+        lines.append(f"| {_cell(episode.configuration)} | {' | '.join(cells)} | {unit} |")
     return f"**{_who(first, scene)}**, onset at {first.onset_s:.2f} s\n\n" + "\n".join(lines)
 
 
@@ -100,13 +105,13 @@ def _overview(of_each: Sequence[pd.DataFrame], scene: Scene) -> str:
     """A row per object, a column per configuration: known after, at a distance, and the verdict."""
     names = list(of_each[0]["configuration"])
     lines = [f"| known after | {' | '.join(map(_cell, names))} |", "| --- |" + " ---: |" * len(names)]
-    for looks in of_each:
+    for episodes in of_each:
         cells = []
-        for look in looks.itertuples():
-            after = f"{look.time_to_detection_s:.2f} s, {_metres(look.distance_at_detection_m)}"
-            verdict = {None: "", "stays clear": ", pass"}.get(verdict_of(look), ", **fail**")
-            cells.append((after if look.detected else "never") + verdict)
-        lines.append(f"| {_who(next(looks.itertuples()), scene)} | {' | '.join(cells)} |")
+        for episode in episodes.itertuples():
+            after = f"{episode.time_to_detection_s:.2f} s, {_metres(episode.distance_at_detection_m)}"
+            verdict = {None: "", "stays clear": ", pass"}.get(verdict_of(episode), ", **fail**")
+            cells.append((after if episode.detected else "never") + verdict)
+        lines.append(f"| {_who(next(episodes.itertuples()), scene)} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -135,7 +140,7 @@ LEGEND = """A configuration has one colour everywhere.
 
 - outlines: what was there (white vehicles, pink pedestrians and two-wheelers, darker where stationary), and the ways of
   those we look at; grey bodies: obstacles
-- filled: what is believed, where it is believed to be, paler the older it is (0 to 1 s); ellipses: 2σ of the position
+- filled: fused tracks at their fused position, paler the older it is (0 to 1 s); ellipses: 2σ of the position
 - white points: units, with the outlines of their fields of view; thin lines: from each, where it was at capture, to
   where it listed somebody
 - red lines: from the unit that sees most of somebody to what hides them

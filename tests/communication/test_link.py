@@ -96,9 +96,9 @@ class TestOneFromOutside:
         plan = experiment(configurations=configurations, pems=pems, runs=3)
         whole = outcome(plan)
         monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
-        monkeypatch.setattr(chunking, "ROWS_A_STRETCH", 40)
+        monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
         cut = outcome(plan)
-        assert len(cut.replays[0].stretches) > 2
+        assert len(cut.replays[0].chunks) > 2
         assert cut.table.equals(whole.table)
         assert cut.summary.equals(whole.summary)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import copem_replay
+from copem_replay.core.compiled import prepare_cache
 from tests.helpers.experiments import TEXT, drive
 from tests.system.test_cli import Call, call, raising
 
@@ -110,3 +111,23 @@ def test_not_even_a_temporary_folder(call: Call, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("copem_replay.experiment.draft.survey.survey", raising(error))
     line = "copem-replay: no folder to cache compiled code in; set NUMBA_CACHE_DIR to one that can be written"
     assert call("info", "drive.mcap") == (2, "", [line])
+
+
+def test_an_index_older_than_its_source_is_removed(tmp_path: Path) -> None:
+    """It may name classes that have gone since, at which Numba fails before it sees that the index is old."""
+    (tmp_path / "__init__.py").touch()
+    cached = tmp_path / "__pycache__"
+    cached.mkdir()
+    for name, index_s in (("old", 90), ("new", 110)):
+        source, index, data = (
+            tmp_path / f"{name}.py",
+            cached / f"{name}.f-1.py311.nbi",
+            cached / f"{name}.f-1.py311.1.nbc",
+        )
+        for path, at_s in ((source, 100), (index, index_s), (data, index_s)):
+            path.touch()
+            os.utime(path, (at_s, at_s))
+    (cached / "gone.f-1.py311.nbi").touch()  # its module has gone: Numba never asks for it
+    assert prepare_cache(tmp_path, {}) is None
+    kept = ["gone.f-1.py311.nbi", "new.f-1.py311.1.nbc", "new.f-1.py311.nbi", "old.f-1.py311.1.nbc"]
+    assert sorted(path.name for path in cached.iterdir()) == kept

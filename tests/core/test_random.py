@@ -11,12 +11,12 @@ import pytest
 from scipy import stats
 from scipy.special import ndtri
 
-from copem_replay.core.random import Address, Dice, normal_quantile, object_words, philox4x32, stable_hash
+from copem_replay.core.random import CounterRng, RandomKey, normal_quantile, object_words, philox4x32, stable_hash
 from copem_replay.core.tracks import Tracks
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.accuracy_tables import with_accuracy
 from copem_replay.pipeline.blocks import blocks, outcomes
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
@@ -57,8 +57,8 @@ def test_stable_hash_is_pinned() -> None:
 ROWS = 2000
 
 
-def address(**changes: Any) -> Address:
-    base = Address(
+def random_key(**changes: Any) -> RandomKey:
+    base = RandomKey(
         ("a", "b"),
         np.arange(ROWS) % 2,
         object_words([str(k % 7) for k in range(ROWS)]),
@@ -69,7 +69,7 @@ def address(**changes: Any) -> Address:
 
 @pytest.mark.parametrize("draw", ["uniform", "normal"])
 def test_numbers_have_the_law_they_should(draw: str) -> None:
-    numbers = getattr(Dice(1, "log"), draw)("purpose", address(), np.arange(100)).ravel()
+    numbers = getattr(CounterRng(1, "log"), draw)("purpose", random_key(), np.arange(100)).ravel()
     law = stats.uniform if draw == "uniform" else stats.norm
     assert stats.kstest(numbers, law.cdf).pvalue > 1e-4
     if draw == "uniform":
@@ -78,34 +78,34 @@ def test_numbers_have_the_law_they_should(draw: str) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_neighbours_are_independent(axis: int) -> None:
-    numbers = Dice(3, "log").normal("purpose", address(), np.arange(200))
+    numbers = CounterRng(3, "log").normal("purpose", random_key(), np.arange(200))
     a, b = (numbers[:-1], numbers[1:]) if axis == 0 else (numbers[:, :-1], numbers[:, 1:])
     z = np.mean(a * b) * np.sqrt(a.size)
     assert abs(z) < 4.5
 
 
 def test_every_part_of_the_address_matters() -> None:
-    base = Dice(1, "log").uniform("p", address(), np.arange(3))
+    base = CounterRng(1, "log").uniform("p", random_key(), np.arange(3))
     others = {
-        "seed": Dice(2, "log").uniform("p", address(), np.arange(3)),
-        "log": Dice(1, "other").uniform("p", address(), np.arange(3)),
-        "purpose": Dice(1, "log").uniform("q", address(), np.arange(3)),
-        "unit": Dice(1, "log").uniform("p", address(units=("x", "y")), np.arange(3)),
-        "run": Dice(1, "log").uniform("p", address(), np.arange(3, 6)),
-        "object": Dice(1, "log").uniform("p", address(object_word=object_words(["z"] * ROWS)), np.arange(3)),
-        "stamp": Dice(1, "log").uniform("p", address(stamp_ns=address().stamp_ns + 1), np.arange(3)),
+        "seed": CounterRng(2, "log").uniform("p", random_key(), np.arange(3)),
+        "log": CounterRng(1, "other").uniform("p", random_key(), np.arange(3)),
+        "purpose": CounterRng(1, "log").uniform("q", random_key(), np.arange(3)),
+        "unit": CounterRng(1, "log").uniform("p", random_key(units=("x", "y")), np.arange(3)),
+        "run": CounterRng(1, "log").uniform("p", random_key(), np.arange(3, 6)),
+        "object": CounterRng(1, "log").uniform("p", random_key(object_word=object_words(["z"] * ROWS)), np.arange(3)),
+        "stamp": CounterRng(1, "log").uniform("p", random_key(stamp_ns=random_key().stamp_ns + 1), np.arange(3)),
     }
     for name, other in others.items():
         assert (base == other).mean() == 0, name
 
 
 def test_bernoulli_is_the_uniform_below_p_and_where_only_spares_work() -> None:
-    dice, runs = Dice(1, "log"), np.arange(5)
+    rng, runs = CounterRng(1, "log"), np.arange(5)
     p = np.linspace(0, 1, ROWS)
-    np.testing.assert_array_equal(dice.bernoulli("p", address(), runs, p), dice.uniform("p", address(), runs) < p)
-    where = dice.bernoulli("p", address(), runs, p)
-    full = dice.normal("e", address(), runs)
-    np.testing.assert_array_equal(dice.normal("e", address(), runs, where), np.where(where, full, 0.0))
+    np.testing.assert_array_equal(rng.bernoulli("p", random_key(), runs, p), rng.uniform("p", random_key(), runs) < p)
+    where = rng.bernoulli("p", random_key(), runs, p)
+    full = rng.normal("e", random_key(), runs)
+    np.testing.assert_array_equal(rng.normal("e", random_key(), runs, where), np.where(where, full, 0.0))
 
 
 # ---- the three properties, through the whole replay ---------------------------------------------------------------
@@ -160,7 +160,7 @@ def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
 
 def test_a_runs_states_do_not_depend_on_how_many_runs_there_are() -> None:
     log = busy_log()
-    a, b = (believed(prepare(log, plan(runs)), plan(runs), 3)["both"].fused for runs in (4, 12))
+    a, b = (tracks_of_run(prepare(log, plan(runs)), plan(runs), 3)["both"].fused for runs in (4, 12))
     for name in ("valid", "x_m", "y_m"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
@@ -194,14 +194,15 @@ def tracks_at(fused: Tracks, log: Recording) -> dict[tuple[str, int], tuple[floa
 
 def test_cropping_the_log_changes_no_draw() -> None:
     whole, cropped = busy_log(), busy_log(from_s=1.5)
-    a, b = (tracks_at(believed(prepare(log, plan()), plan(), 2)["PEM"].fused, log) for log in (whole, cropped))
+    a, b = (tracks_at(tracks_of_run(prepare(log, plan()), plan(), 2)["PEM"].fused, log) for log in (whole, cropped))
     assert b
     assert {key: value for key, value in a.items() if key[1] >= cropped.scene.t0_ns} == b
 
 
 def test_another_log_has_other_dice() -> None:
     a, b = (
-        tracks_at(believed(prepare(log, plan()), plan(), 2)["PEM"].fused, log) for log in (busy_log("a"), busy_log("b"))
+        tracks_at(tracks_of_run(prepare(log, plan()), plan(), 2)["PEM"].fused, log)
+        for log in (busy_log("a"), busy_log("b"))
     )
     assert set(a) != set(b)
     assert not set(a.values()) & set(b.values())
@@ -211,5 +212,5 @@ def test_configurations_share_their_draws() -> None:
     """The ego's unit alone, and in company: what it listed itself is in both, run by run."""
     log, both = busy_log(), plan(configurations={"PEM": {"units": ["ego"]}, "all": {"units": "all"}})
     for number in range(5):
-        fused = believed(prepare(log, both), both, number)
+        fused = tracks_of_run(prepare(log, both), both, number)
         assert set(tracks_at(fused["PEM"].fused, log)) <= set(tracks_at(fused["all"].fused, log))

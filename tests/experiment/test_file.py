@@ -17,7 +17,7 @@ from copem_replay.core.components import Component
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import Float
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.file import load, log_paths, parse
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import Ideal, Inbox, StepFusion
@@ -66,8 +66,8 @@ show: {logs: [first], run: 0}
 class Always(DetectionModel):
     sure: bool = True
 
-    def probability(self, look: Look) -> Float:
-        return look.visible_share * 0 + 1
+    def probability(self, episode: ViewGeometry) -> Float:
+        return episode.visible_share * 0 + 1
 
 
 class NoModel(Component):

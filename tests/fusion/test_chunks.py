@@ -1,4 +1,4 @@
-"""Instants handed over in stretches: every fusion gives the lists of one go, to the last bit."""
+"""Instants handed over in time chunks: every fusion gives the lists of one go, to the last bit."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from copem_replay.core.errors import InputError
-from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.fusion.base import Inbox, ListFusion, StepFusion, fused_by, resumed_by
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.testing.chunks import needed_lists, one_after_another, stretch
+from copem_replay.fusion.testing.chunks import chunk, needed_lists, one_after_another
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
 from tests.fusion.test_tracker import street
-from tests.helpers.reports import entry, reports_of, stretches
+from tests.helpers.reports import chunks, entry, inputs_of
 
 
 class Walk(StepFusion):
@@ -63,38 +63,38 @@ WORLDS: list[dict[str, Any]] = [
 
 
 @functools.cache
-def world(number: int) -> Reports:
+def world(number: int) -> Inputs:
     return street(**WORLDS[number])
 
 
 @functools.cache
-def at_once(which: int, number: int) -> Lists:
+def at_once(which: int, number: int) -> ObjectLists:
     return fused_by(FUSIONS[which], world(number), "fusion")
 
 
-def in_stretches(fusion: ListFusion, told: Reports, places: list[tuple[int, int]], looks_back_s: float) -> Lists:
+def in_chunks(fusion: ListFusion, told: Inputs, places: list[tuple[int, int]], looks_back_s: float) -> ObjectLists:
     memory: Any = None
     parts = []
     for a, b in places:
-        found, memory = resumed_by(fusion, stretch(told, a, b, looks_back_s), memory, "fusion")
+        found, memory = resumed_by(fusion, chunk(told, a, b, looks_back_s), memory, "fusion")
         parts.append(found)
     return one_after_another(parts)
 
 
 @settings(max_examples=120)
 @given(st.integers(0, len(FUSIONS) - 1), st.integers(0, len(WORLDS) - 1), st.lists(st.floats(0, 1), max_size=8))
-def test_stretches_give_the_lists_of_one_go_to_the_last_bit(which: int, number: int, cuts: list[float]) -> None:
+def test_chunks_give_the_lists_of_one_go_to_the_last_bit(which: int, number: int, cuts: list[float]) -> None:
     fusion, told, expected = FUSIONS[which], world(number), at_once(which, number)
-    found = in_stretches(fusion, told, stretches(cuts, len(told.issue_s)), fusion.looks_back_s)
+    found = in_chunks(fusion, told, chunks(cuts, len(told.issue_s)), fusion.looks_back_s)
     assert np.array_equal(found.start, expected.start)
     assert found.entries.tobytes() == expected.entries.tobytes()
 
 
 @pytest.mark.parametrize("which", range(len(FUSIONS)))
-def test_so_do_stretches_of_one_instant_each(which: int) -> None:
+def test_so_do_chunks_of_one_instant_each(which: int) -> None:
     fusion, told, expected = FUSIONS[which], world(2), at_once(which, 2)
     assert len(expected.entries) > 20
-    found = in_stretches(fusion, told, list(pairwise(range(len(told.issue_s) + 1))), fusion.looks_back_s)
+    found = in_chunks(fusion, told, list(pairwise(range(len(told.issue_s) + 1))), fusion.looks_back_s)
     assert np.array_equal(found.start, expected.start)
     assert found.entries.tobytes() == expected.entries.tobytes()
 
@@ -102,11 +102,11 @@ def test_so_do_stretches_of_one_instant_each(which: int) -> None:
 @pytest.mark.parametrize("late", ["stale", "predict", "replay"])
 def test_a_track_goes_on_over_a_cut(late: str) -> None:
     times = [0.0, 0.25, 0.5, 0.75]
-    told = reports_of([[entry(t, vx_mps=1.0) for t in times]], ["a"] * 4, times, times)
+    told = inputs_of([[entry(t, vx_mps=1.0) for t in times]], ["a"] * 4, times, times)
     fusion = Tracker(late=late)
     memory = None
     for a, b in ((0, 2), (2, 2), (2, 3), (3, 4)):
-        found, memory = resumed_by(fusion, stretch(told, a, b, fusion.looks_back_s), memory, "fusion")
+        found, memory = resumed_by(fusion, chunk(told, a, b, fusion.looks_back_s), memory, "fusion")
     assert found.entries["track_id"].tolist() == [0]
     # Four entries at one variance: of a filter begun anew it would be the entry's own, and not yet confirmed.
     assert found.entries["cov_ee_m2"][0] < 0.8
@@ -115,7 +115,7 @@ def test_a_track_goes_on_over_a_cut(late: str) -> None:
 def test_whoever_hears_again_needs_what_was_heard_of_late() -> None:
     fusion, told = Tracker(late="replay"), world(2)
     each = list(pairwise(range(len(told.issue_s) + 1)))
-    found, expected = in_stretches(fusion, told, each, 0.0), fused_by(fusion, told, "fusion")
+    found, expected = in_chunks(fusion, told, each, 0.0), fused_by(fusion, told, "fusion")
     assert not np.array_equal(found.start, expected.start) or found.entries.tobytes() != expected.entries.tobytes()
 
 
@@ -127,15 +127,15 @@ LISTS = st.lists(
 
 
 @given(LISTS, st.tuples(st.floats(0, 1), st.floats(0, 1)), st.sampled_from([0.0, 0.25, 1.0]))
-def test_the_lists_a_stretch_needs(
+def test_the_lists_a_chunk_needs(
     lists: list[tuple[int, int, int | None]], cuts: tuple[float, float], looks_back_s: float
 ) -> None:
     """Captures and ways in eighths of a second; a way of None: lost."""
     captured = [c / 8 for _, c, _ in lists]
     arrives = [np.inf if way is None else (c + way) / 8 for _, c, way in lists]
     said = [entry(float(f)) for f in range(len(lists))]
-    told = reports_of([said, said], [f"u{u}" for u, _, _ in lists], captured, arrives, names=["u0", "u1", "u2"])
-    a, b = stretches(cuts, len(told.issue_s))[1]
+    told = inputs_of([said, said], [f"u{u}" for u, _, _ in lists], captured, arrives, names=["u0", "u1", "u2"])
+    a, b = chunks(cuts, len(told.issue_s))[1]
     now_s = told.issue_s[a:b].tolist()
     expected = set()
     if now_s:
@@ -145,7 +145,7 @@ def test_the_lists_a_stretch_needs(
         if looks_back_s > 0:
             expected |= {f for f in earlier if captured[f] >= max(captured[g] for g in earlier) - looks_back_s}
     assert set(np.flatnonzero(needed_lists(told.captured_s, told, a, b, looks_back_s)).tolist()) == expected
-    one = stretch(told, a, b, looks_back_s)
+    one = chunk(told, a, b, looks_back_s)
     for s in (0, 1):
         assert [len(one.lists.of(s, f)) for f in range(len(lists))] == [f in expected for f in range(len(lists))]
         assert all(one.lists.of(s, f)["x_m"] == [f] for f in expected)
@@ -162,14 +162,14 @@ def test_whoever_overrides_fuse_has_to_say_anew_that_it_can_be_resumed() -> None
         min_existence: float = 0.5
 
     class Other(Tracker):
-        def fuse(self, reports: Reports) -> Lists:
-            return super().fuse(reports)
+        def fuse(self, inputs: Inputs) -> ObjectLists:
+            return super().fuse(inputs)
 
     class Sure(Other):
         resumable: ClassVar[bool] = True
 
-        def fuse(self, reports: Reports) -> Lists:
-            return super().fuse(reports)
+        def fuse(self, inputs: Inputs) -> ObjectLists:
+            return super().fuse(inputs)
 
     assert (Quiet().resumable, Other().resumable, Sure().resumable, Walk().resumable) == (True, False, True, True)
     assert "resumable" not in Sure().model_dump()
@@ -178,15 +178,15 @@ def test_whoever_overrides_fuse_has_to_say_anew_that_it_can_be_resumed() -> None
 class NoMemory(Union):
     kind: str = "tests.fusion.test_chunks:NoMemory"
 
-    def resume(self, reports: Reports, memory: Any) -> Any:
-        return self.fuse(reports)
+    def resume(self, inputs: Inputs, memory: Any) -> Any:
+        return self.fuse(inputs)
 
 
 class TooSure(Union):
     kind: str = "tests.fusion.test_chunks:TooSure"
 
-    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
-        found = self.fuse(reports)
+    def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
+        found = self.fuse(inputs)
         found.entries["existence"] = 2.0
         return found, None
 
@@ -194,15 +194,15 @@ class TooSure(Union):
 class Crashes(Union):
     kind: str = "tests.fusion.test_chunks:Crashes"
 
-    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
+    def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
         raise KeyError("gone")
 
 
 class AllOfThem(Union):
     kind: str = "tests.fusion.test_chunks:AllOfThem"
 
-    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
-        return reports.lists, memory
+    def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
+        return inputs.lists, memory
 
 
 HERE = r" \(.*test_chunks.py:\d+\)$"
@@ -211,7 +211,7 @@ HERE = r" \(.*test_chunks.py:\d+\)$"
 @pytest.mark.parametrize(
     ("fusion", "said"),
     [
-        (NoMemory, rf"NoMemory: resume: expected Lists and a memory, found Lists{HERE}"),
+        (NoMemory, rf"NoMemory: resume: expected ObjectLists and a memory, found ObjectLists{HERE}"),
         (TooSure, rf"TooSure: existence: expected probabilities, found 2 … 2{HERE}"),
         (Crashes, rf"Crashes: KeyError: 'gone'{HERE}"),
         (AllOfThem, rf"AllOfThem: fuse: expected lists of ENTRY with start \(1, 3\), .* with start \(1, 37\){HERE}"),
@@ -219,13 +219,13 @@ HERE = r" \(.*test_chunks.py:\d+\)$"
 )
 def test_a_wrong_answer_is_named_by_its_place(fusion: type[ListFusion], said: str) -> None:
     with pytest.raises(InputError, match=rf"^configurations.mine.fusion: tests.fusion.test_chunks:{said}"):
-        resumed_by(fusion(), stretch(world(0), 0, 2, 0.0), None, "configurations.mine.fusion")
+        resumed_by(fusion(), chunk(world(0), 0, 2, 0.0), None, "configurations.mine.fusion")
 
 
-def test_nothing_but_the_stretch_is_changed() -> None:
+def test_nothing_but_the_chunk_is_changed() -> None:
     told = world(1)
-    one = stretch(told, 2, 5, 0.5)
+    one = chunk(told, 2, 5, 0.5)
     same = ("units", "unit_ix", "captured_s", "arrives_s")
     assert all(getattr(one, name) is getattr(told, name) for name in same)
-    whole = stretch(replace(told), 0, len(told.issue_s), 0.0)
+    whole = chunk(replace(told), 0, len(told.issue_s), 0.0)
     assert whole.lists.entries.tobytes() == told.lists.entries.tobytes()  # all arrive

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from copem_replay.core.object_list import ENTRY, Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import ENTRY, Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES
 from copem_replay.fusion.content_order import sort_rows
 from copem_replay.fusion.gnn import Gnn
-from tests.helpers.reports import entry, joined, reports_of
+from tests.helpers.reports import entry, inputs_of, joined
 from tests.oracles import gnn as gnn_oracle
 from tests.oracles.gnn import in_any_order, random_reports
 
@@ -20,10 +20,10 @@ COMBINATIONS = ("inverse_variance", "covariance_intersection", "fast_covariance_
 WIDE, HIGH = (4.0, 0.0, 1.0), (1.0, 0.0, 4.0)
 
 
-def together(*lists: Entries, captured_s: list[float] | None = None) -> Reports:
+def together(*lists: Entries, captured_s: list[float] | None = None) -> Inputs:
     """Lists of as many units, all there at 0.5 s."""
     names = [f"unit {k}" for k in range(len(lists))]
-    return reports_of([lists], names, captured_s or [0.0] * len(lists), [0.5] * len(lists))
+    return inputs_of([lists], names, captured_s or [0.0] * len(lists), [0.5] * len(lists))
 
 
 def fused(*lists: Entries, **settings: object) -> Entries:
@@ -136,10 +136,10 @@ def test_no_unit_is_twice_in_one_cluster():
 def test_a_cluster_is_where_its_members_so_far_are():
     # After 0 and 0: variance 0.5 where information is summed, so 4 is 16/1.5 away; intersected 1, and 16/2.
     units = [entry(0.0), entry(0.0), entry(4.0)]
-    reports = together(*units, captured_s=[0.3, 0.2, 0.1])
-    assert sorted(Gnn().fuse(reports).entries["x_m"]) == [0.0, 4.0]
+    inputs = together(*units, captured_s=[0.3, 0.2, 0.1])
+    assert sorted(Gnn().fuse(inputs).entries["x_m"]) == [0.0, 4.0]
     for combine in COMBINATIONS[1:]:
-        assert Gnn(combine=combine).fuse(reports).entries["x_m"] == pytest.approx([4 / 3])
+        assert Gnn(combine=combine).fuse(inputs).entries["x_m"] == pytest.approx([4 / 3])
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_opposite_yaws_leave_the_first_ones():
 
 def test_a_stale_list_is_taken_as_it_is_until_it_is_too_old():
     lists = [entry(0.0), entry(2.0), entry(2.0)]
-    found = Gnn().fuse(reports_of([lists], ["a", "b", "b"], [0.0, 0.9, 1.1], [0.0, 0.9, 1.1]))
+    found = Gnn().fuse(inputs_of([lists], ["a", "b", "b"], [0.0, 0.9, 1.1], [0.0, 0.9, 1.1]))
     assert found.start.tolist() == [[0, 1, 2, 3]]
     assert found.entries["x_m"].tolist() == [0.0, 1.0, 2.0]
     assert found.entries["captured_s"].tolist() == [0.0, 0.9, 1.1]
@@ -245,19 +245,19 @@ def test_a_stale_list_is_taken_as_it_is_until_it_is_too_old():
 
 def test_the_unit_is_the_one_that_was_there_first():
     for arrives_s, first in (([0.2, 0.1], 1), ([0.1, 0.2], 0), ([0.2, 0.2], 0)):
-        reports = reports_of([[entry(0.0), entry(0.1)]], ["a", "b"], [0.05, 0.0], arrives_s, names=["a", "b"])
-        found = Gnn().fuse(reports).of(0, len(reports.issue_s) - 1)
+        inputs = inputs_of([[entry(0.0), entry(0.1)]], ["a", "b"], [0.05, 0.0], arrives_s, names=["a", "b"])
+        found = Gnn().fuse(inputs).of(0, len(inputs.issue_s) - 1)
         assert found["unit_ix"].tolist() == [first]
         assert found["captured_s"].tolist() == [0.05]
 
 
 def test_lists_without_entries_and_no_lists_at_all():
     nothing = entries_of(0)
-    empty = Gnn().fuse(reports_of([[nothing, nothing]] * 2, ["a", "b"], [0.0, 0.1], [0.0, 0.1]))
+    empty = Gnn().fuse(inputs_of([[nothing, nothing]] * 2, ["a", "b"], [0.0, 0.1], [0.0, 0.1]))
     assert empty.start.tolist() == [[0, 0, 0]] * 2
-    never = Gnn().fuse(reports_of([[entry(0.0)]], ["a"], [0.0], [np.inf]))
+    never = Gnn().fuse(inputs_of([[entry(0.0)]], ["a"], [0.0], [np.inf]))
     assert never.start.tolist() == [[0]]
-    assert len(Gnn().fuse(reports_of([[]], [], [], [], names=["a"])).entries) == 0
+    assert len(Gnn().fuse(inputs_of([[]], [], [], [], names=["a"])).entries) == 0
     assert xs(nothing, entry(1.0), nothing) == [1.0]
 
 
@@ -282,7 +282,7 @@ def test_what_is_no_setting_is_refused(wrong: dict[str, object]):
 # ------------------------------------------------------------------------- against NumPy and SciPy
 
 
-def assert_same(found: Lists, expected: Lists, tolerance: dict[str, float]) -> None:
+def assert_same(found: ObjectLists, expected: ObjectLists, tolerance: dict[str, float]) -> None:
     assert found.start.tolist() == expected.start.tolist()
     for name in ENTRY.names or ():
         off = np.abs(found.entries[name] - expected.entries[name])
@@ -297,21 +297,21 @@ def assert_same(found: Lists, expected: Lists, tolerance: dict[str, float]) -> N
     [(2, 3, 6, False), (5, 10, 3, False), (20, 15, 2, True), (6, 60, 2, True)],
 )
 def test_it_is_the_plain_program(units: int, objects: int, captures: int, together: bool, combine: str):
-    reports = random_reports(units, units=units, objects=objects, captures=captures, runs=2, together=together)
+    inputs = random_reports(units, units=units, objects=objects, captures=captures, runs=2, together=together)
     settings = {"combine": combine, "min_existence": 0.15}
     # Where the criterion is flat, what a general optimiser finds is the less accurate of the two.
     general = combine == "covariance_intersection"
     tolerance = dict.fromkeys(("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2"), 1e-4 if general else 1e-9)
-    assert_same(Gnn(**settings).fuse(reports), gnn_oracle.fuse(reports, **settings), tolerance)
+    assert_same(Gnn(**settings).fuse(inputs), gnn_oracle.fuse(inputs, **settings), tolerance)
 
 
 def test_crowds_are_assigned_as_by_the_plain_program():
     # Thirty objects to 100 m² instead of one: every entry has several clusters to choose from.
-    reports = random_reports(3, units=6, objects=40, captures=2)
+    inputs = random_reports(3, units=6, objects=40, captures=2)
     for name in ("x_m", "y_m"):
-        reports.lists.entries[name] /= math.sqrt(30)
-    found = Gnn(gate=0.999).fuse(reports)
-    assert_same(found, gnn_oracle.fuse(reports, gate=0.999), {})
+        inputs.lists.entries[name] /= math.sqrt(30)
+    found = Gnn(gate=0.999).fuse(inputs)
+    assert_same(found, gnn_oracle.fuse(inputs, gate=0.999), {})
 
 
 # ------------------------------------------------------------------------- properties
@@ -330,12 +330,12 @@ some_entries = st.lists(
 )
 
 
-def shuffled(lists: list[list[Entries]], order: list[int], seed: int, captured_s: list[float]) -> Reports:
+def shuffled(lists: list[list[Entries]], order: list[int], seed: int, captured_s: list[float]) -> Inputs:
     """The units in this order, the entries of each list in another."""
     rng = np.random.default_rng(seed)
     mixed = [joined(*(lists[u][i] for i in rng.permutation(len(lists[u])))) for u in order]
     names = [f"unit {u}" for u in order]
-    return reports_of([mixed], names, [captured_s[u] for u in order], [0.5 + 1e-9 * u for u in order], names=names)
+    return inputs_of([mixed], names, [captured_s[u] for u in order], [0.5 + 1e-9 * u for u in order], names=names)
 
 
 @given(
@@ -365,16 +365,16 @@ def test_nothing_is_lost_and_covariances_are_positive_definite(lists: list[list[
 
 @pytest.mark.parametrize("combine", COMBINATIONS)
 def test_a_run_alone_is_the_run_among_others(combine: str):
-    reports = random_reports(5, units=3, objects=6, captures=2, runs=3)
-    found = Gnn(combine=combine).fuse(reports)
-    assert found.start.shape == (3, len(reports.issue_s) + 1)
-    names = [reports.units[u] for u in reports.unit_ix]
+    inputs = random_reports(5, units=3, objects=6, captures=2, runs=3)
+    found = Gnn(combine=combine).fuse(inputs)
+    assert found.start.shape == (3, len(inputs.issue_s) + 1)
+    names = [inputs.units[u] for u in inputs.unit_ix]
     for run in range(3):
-        lists = [reports.lists.of(run, f) for f in range(len(reports.unit_ix))]
+        lists = [inputs.lists.of(run, f) for f in range(len(inputs.unit_ix))]
         alone = Gnn(combine=combine).fuse(
-            reports_of([lists], names, reports.captured_s.tolist(), reports.arrives_s.tolist())
+            inputs_of([lists], names, inputs.captured_s.tolist(), inputs.arrives_s.tolist())
         )
-        for k in range(len(reports.issue_s)):
+        for k in range(len(inputs.issue_s)):
             assert alone.of(0, k).tobytes() == found.of(run, k).tobytes()
 
 

@@ -14,27 +14,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from copem_replay.communication.arrivals import instants
+from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.communication.link import ConstantLink, transmit
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import candidates
+from copem_replay.perception.observation import observations
 from copem_replay.perception.perceive import perceive
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 Array = npt.NDArray[np.float64]
 Says = dict[str, Any]
 """What a list says of one object: values, uncertainties, `valid`; by run where it is a sequence."""
-Lists = list[tuple[float, dict[int, Says]]]
+ObjectLists = list[tuple[float, dict[int, Says]]]
 """A unit's lists: captured when, and what it says of which object."""
 
 USUAL: Says = dict.fromkeys(VALUES, 0.0) | dict.fromkeys(UNCERTAINTIES, 0.0) | {"valid": True}
 USUAL |= {"length_m": 1.0, "width_m": 1.0, "height_m": 1.0, "cov_ee_m2": 1.0, "cov_nn_m2": 1.0}
 
 
-def heard(units: dict[str, Lists], latency_s: dict[str, float] | None = None, runs: int = 1) -> Tracks:
+def heard(units: dict[str, ObjectLists], latency_s: dict[str, float] | None = None, runs: int = 1) -> Tracks:
     """The lists of `units` as tracks, in the order of the units; without `latency_s` they arrive as captured."""
     frames = [(unit, k) for unit in units for k in range(len(units[unit]))]
     start, unit_ix, object_ix, frame_ix = [0], [], [], []
@@ -285,15 +285,15 @@ def laws() -> list[tuple[Array, Array]]:
     return result
 
 
-def beliefs(probability: float, log: Recording, without: int = -1) -> dict[str, Tracks]:
+def run_tracks(probability: float, log: Recording, without: int = -1) -> dict[str, Tracks]:
     """What is believed in all runs, by either way of combining."""
     plan = three_units(probability)
-    found = candidates(log.scene, log.truth, plan)
+    found = observations(log.scene, log.truth, plan)
     result = {}
     for combine in ("samples", "posterior"):
         seen = perceive(log.scene, found, plan, RUNS, states="sampled" if combine == "samples" else "expected")
-        belief = fuse(transmit(seen, ConstantLink(), "link"), max_age_s=1.0, without_object_ix=without)
-        drawn = draw_posterior(belief, log.scene, plan.seed, RUNS) if combine == "posterior" else belief
+        fused_tracks = fuse(transmit(seen, ConstantLink(), "link"), max_age_s=1.0, without_object_ix=without)
+        drawn = draw_posterior(fused_tracks, log.scene, plan.seed, RUNS) if combine == "posterior" else fused_tracks
         result[combine] = drawn.fused
     return result
 
@@ -306,7 +306,7 @@ def whitened(offsets: Array, mean: Array, c: Array) -> Array:
 
 @pytest.fixture(scope="module")
 def both() -> dict[str, Tracks]:
-    return beliefs(1.0, watched(until_s=0.1))
+    return run_tracks(1.0, watched(until_s=0.1))
 
 
 class TestLaw:
@@ -358,12 +358,12 @@ class TestLaw:
     def test_it_is_the_law_of_those_that_saw(self) -> None:
         """Each unit lists with 0.6: per run μ and Σ of the units that did; believed in 1 − 0.4³ of the runs."""
         log, plan = watched(), three_units(0.6)
-        found = candidates(log.scene, log.truth, plan)
+        found = observations(log.scene, log.truth, plan)
         valid = perceive(log.scene, found, plan, RUNS, states="true").valid
         rows = [int(np.flatnonzero((found.tracks.row_object_ix == WALKER) & (found.tracks.row_unit_ix == u))[0])
                 for u in range(3)]  # fmt: skip
         saw = valid[:, rows]
-        for of in beliefs(0.6, log).values():
+        for of in run_tracks(0.6, log).values():
             (row,) = np.flatnonzero(of.row_object_ix == WALKER)
             assert np.array_equal(of.valid[:, row], saw.any(axis=1))
             assert stats.binomtest(int(of.valid[:, row].sum()), len(RUNS), 1 - 0.4**3).pvalue > 1e-6
@@ -381,7 +381,7 @@ class TestLaw:
             assert abs(np.corrcoef(z)[0, 1]) < 5 / math.sqrt(z.shape[1])
 
     def test_nothing_under_what_nobody_saw(self) -> None:
-        for of in beliefs(0.2, watched()).values():
+        for of in run_tracks(0.2, watched()).values():
             for name in (*VALUES, "cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
                 column = np.broadcast_to(getattr(of, name), of.valid.shape)
                 assert np.isfinite(column[of.valid]).all()
@@ -390,8 +390,8 @@ class TestLaw:
     def test_the_receivers_own_body_is_left_out(self) -> None:
         """The van and the mast see the ego; it does not list itself."""
         log = watched()
-        assert 0 in beliefs(1.0, log)["samples"].object_ix
-        without = beliefs(1.0, log, without=0)["samples"]
+        assert 0 in run_tracks(1.0, log)["samples"].object_ix
+        without = run_tracks(1.0, log, without=0)["samples"]
         assert sorted(without.object_ix) == [1, 2]
 
 
@@ -452,7 +452,7 @@ class TestStaleLists:
     @pytest.mark.parametrize(("latency_s", "last_s"), [(0.0, 0.3), (0.2, 0.5)])
     def test_lists_grow_too_old(self, latency_s: float, last_s: float) -> None:
         """One list alone, 0.3 s of age allowed from capture, on top of its own way; the other unit's go on."""
-        listing: dict[str, Lists] = {
+        listing: dict[str, ObjectLists] = {
             "once": [(0.0, {0: gauss(1, 1, SMALL)})],
             "on": [(k / 10, {1: gauss(9, 9, SMALL)}) for k in range(9)],
         }
@@ -494,7 +494,7 @@ class TestStaleLists:
     def test_nothing_heard_at_all(self) -> None:
         assert issued(heard({"a": [], "b": []})) == []
         assert issued(heard({"a": []})) == []
-        assert instants(heard({"a": []}), max_age_s=1.0).issue_s.tolist() == []
+        assert fusion_schedule(heard({"a": []}), max_age_s=1.0).issue_s.tolist() == []
 
 
 TICK = 10
@@ -537,7 +537,7 @@ def test_against_the_words(
 ) -> None:
     """A list at every instant at which one arrives; each unit's newest that has arrived and is not too old."""
     units, latency = world
-    in_seconds: dict[str, Lists] = {u: [(t / 1000, held) for t, held in its] for u, its in units.items()}
+    in_seconds: dict[str, ObjectLists] = {u: [(t / 1000, held) for t, held in its] for u, its in units.items()}
     of = heard(in_seconds, {u: late / 1000 for u, late in latency.items()}, runs=2)
     fused = fuse(of, max_age_s=max_age / 1000, without_object_ix=own).fused
     instants = sorted({t + latency[u] for u, its in units.items() for t, _ in its})

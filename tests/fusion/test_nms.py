@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from copem_replay.core.object_list import Entries, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, entries_of
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
 from copem_replay.fusion.nms import Nms
-from tests.helpers.reports import entry, joined, reports_of
+from tests.helpers.reports import entry, inputs_of, joined
 from tests.oracles.gnn import in_any_order, random_reports
 
 BIG = (2.0, 0.0, 2.0)
@@ -22,7 +22,7 @@ def kept(component: Nms, *lists: Entries) -> list[float]:
     """The x of what is kept of lists of as many units, captured together."""
     names = [f"unit {k}" for k in range(len(lists))]
     times = [0.0] * len(lists)
-    return sorted(component.fuse(reports_of([lists], names, times, times)).entries["x_m"].tolist())
+    return sorted(component.fuse(inputs_of([lists], names, times, times)).entries["x_m"].tolist())
 
 
 # ------------------------------------------------------------------------- by hand
@@ -31,7 +31,7 @@ def kept(component: Nms, *lists: Entries) -> list[float]:
 def test_of_two_boxes_of_one_object_the_more_certain_is_kept_unchanged():
     # 4 m × 2 m, a metre apart lengthwise: 6 of 10 square metres in common.
     lists = [entry(0.0, existence=0.7, track_id=3), entry(1.0, existence=0.8, vx_mps=2.0, cov=BIG, track_id=4)]
-    fused = Nms().fuse(reports_of([lists], ["a", "b"], [0.2, 0.1], [0.2, 0.2]))
+    fused = Nms().fuse(inputs_of([lists], ["a", "b"], [0.2, 0.1], [0.2, 0.2]))
     expected = lists[1].copy()
     expected["captured_s"], expected["unit_ix"], expected["track_id"] = 0.1, 1, -1
     assert fused.start.tolist() == [[0, 1]]
@@ -65,16 +65,16 @@ def test_of_equally_likely_ones_the_smaller_covariance_is_kept():
 
 
 def test_then_the_newer_capture_then_the_place():
-    newer = Nms().fuse(reports_of([[entry(0.0), entry(1.0)]], ["a", "b"], [0.0, 0.1], [0.2, 0.2]))
+    newer = Nms().fuse(inputs_of([[entry(0.0), entry(1.0)]], ["a", "b"], [0.0, 0.1], [0.2, 0.2]))
     assert newer.entries["x_m"].tolist() == [1.0]
     assert kept(Nms(), entry(1.0), entry(0.5)) == [0.5]
-    fused = Nms().fuse(reports_of([[entry(0.0, 1.0), entry(0.0, 0.5)]], ["a", "b"], [0.0] * 2, [0.0] * 2))
+    fused = Nms().fuse(inputs_of([[entry(0.0, 1.0), entry(0.0, 0.5)]], ["a", "b"], [0.0] * 2, [0.0] * 2))
     assert fused.entries["y_m"].tolist() == [0.5]
 
 
 def test_of_the_very_same_entry_it_is_the_unit_that_came_first():
     for arrives_s, first in (([0.2, 0.1], 1), ([0.1, 0.2], 0), ([0.2, 0.2], 0)):
-        fused = Nms().fuse(reports_of([[entry(0.0)] * 2], ["a", "b"], [0.0, 0.0], arrives_s, names=["a", "b"]))
+        fused = Nms().fuse(inputs_of([[entry(0.0)] * 2], ["a", "b"], [0.0, 0.0], arrives_s, names=["a", "b"]))
         assert fused.of(0, len(fused.start[0]) - 2)["unit_ix"].tolist() == [first]
 
 
@@ -120,16 +120,16 @@ def test_nothing_said_of_the_class_agrees_with_all(named: str):
 def test_a_list_that_is_too_old_suppresses_no_more():
     # The certain one is at the receiver for 1 s.
     lists = [entry(0.0), entry(0.5, existence=0.5), entry(0.6, existence=0.5)]
-    fused = Nms().fuse(reports_of([lists], ["a", "b", "b"], [0.0, 0.9, 1.1], [0.0, 0.9, 1.1]))
+    fused = Nms().fuse(inputs_of([lists], ["a", "b", "b"], [0.0, 0.9, 1.1], [0.0, 0.9, 1.1]))
     assert [fused.of(0, k)["x_m"].tolist() for k in range(3)] == [[0.0], [0.0], [0.6]]
 
 
 def test_lists_without_entries_and_no_lists_at_all():
-    fused = Nms().fuse(reports_of([[entries_of(0), entries_of(0)]] * 2, ["a", "b"], [0.0, 0.1], [0.0, 0.1]))
+    fused = Nms().fuse(inputs_of([[entries_of(0), entries_of(0)]] * 2, ["a", "b"], [0.0, 0.1], [0.0, 0.1]))
     assert fused.start.tolist() == [[0, 0, 0]] * 2
-    never = Nms().fuse(reports_of([[entry(0.0)]], ["a"], [0.0], [np.inf]))
+    never = Nms().fuse(inputs_of([[entry(0.0)]], ["a"], [0.0], [np.inf]))
     assert never.start.tolist() == [[0]]
-    assert len(Nms().fuse(reports_of([[]], [], [], [], names=["a"])).entries) == 0
+    assert len(Nms().fuse(inputs_of([[]], [], [], [], names=["a"])).entries) == 0
 
 
 @pytest.mark.parametrize("wrong", [{"iou": 1.1}, {"radius_m": 0.0}, {"min_existence": -0.1}, {"by": "area"}])
@@ -176,12 +176,12 @@ def plainly(component: Nms, entries: Entries) -> list[Entries]:
 @pytest.mark.parametrize("component", [Nms(), Nms(by="centre"), Nms(iou=0.5, min_existence=0.6)])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_it_is_the_plain_loop(component: Nms, seed: int):
-    reports = random_reports(seed, units=4, objects=12, captures=2, runs=2)
-    fused = component.fuse(reports)
+    inputs = random_reports(seed, units=4, objects=12, captures=2, runs=2)
+    fused = component.fuse(inputs)
     suppressed = 0
     for run in range(2):
-        for k, newest in enumerate(reports.newest):
-            given = joined(*(reports.lists.of(run, f) for f in newest if f >= 0))
+        for k, newest in enumerate(inputs.newest):
+            given = joined(*(inputs.lists.of(run, f) for f in newest if f >= 0))
             expected = joined(*(one.reshape(1) for one in plainly(component, given)))
             suppressed += len(given) - len(expected)
             assert in_any_order(fused.of(run, k)) == in_any_order(expected)
@@ -204,12 +204,12 @@ some_entries = st.lists(
 )
 
 
-def shuffled(lists: list[list[Entries]], order: list[int], seed: int, captured_s: list[float]) -> Reports:
+def shuffled(lists: list[list[Entries]], order: list[int], seed: int, captured_s: list[float]) -> Inputs:
     """The units in this order, the entries of each list in another."""
     rng = np.random.default_rng(seed)
     mixed = [joined(*(lists[u][i] for i in rng.permutation(len(lists[u])))) for u in order]
     names = [f"unit {u}" for u in order]
-    return reports_of([mixed], names, [captured_s[u] for u in order], [0.5 + 1e-9 * u for u in order], names=names)
+    return inputs_of([mixed], names, [captured_s[u] for u in order], [0.5 + 1e-9 * u for u in order], names=names)
 
 
 @given(
@@ -227,14 +227,14 @@ def test_neither_the_order_of_units_nor_that_of_entries_counts(
 
 
 def test_a_run_alone_is_the_run_among_others():
-    reports = random_reports(5, units=3, objects=6, captures=2, runs=3)
-    fused = Nms().fuse(reports)
-    assert fused.start.shape == (3, len(reports.issue_s) + 1)
+    inputs = random_reports(5, units=3, objects=6, captures=2, runs=3)
+    fused = Nms().fuse(inputs)
+    assert fused.start.shape == (3, len(inputs.issue_s) + 1)
     for run in range(3):
-        lists = [reports.lists.of(run, f) for f in range(len(reports.unit_ix))]
-        names = [reports.units[u] for u in reports.unit_ix]
-        alone = Nms().fuse(reports_of([lists], names, reports.captured_s.tolist(), reports.arrives_s.tolist()))
-        for k in range(len(reports.issue_s)):
+        lists = [inputs.lists.of(run, f) for f in range(len(inputs.unit_ix))]
+        names = [inputs.units[u] for u in inputs.unit_ix]
+        alone = Nms().fuse(inputs_of([lists], names, inputs.captured_s.tolist(), inputs.arrives_s.tolist()))
+        for k in range(len(inputs.issue_s)):
             assert alone.of(0, k).tobytes() == fused.of(run, k).tobytes()
 
 

@@ -11,11 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.fusion.base import Inbox, ListFusion, StepFusion
 from copem_replay.fusion.gnn import Gnn
 from copem_replay.fusion.nms import Nms
-from copem_replay.fusion.testing.check import RULES, NonconformingError, check_fusion
+from copem_replay.fusion.testing.check import FUSION_RULES, NonconformingError, check_fusion
 from copem_replay.fusion.tracker import Tracker
 from copem_replay.fusion.union import Union
 
@@ -146,8 +146,8 @@ class NothingForNothing(Plain):
 class NoLists(ListFusion):
     kind: str = "tests.fusion.test_testing:NoLists"
 
-    def fuse(self, reports: Reports) -> Any:
-        return [[entries_of(0) for _ in reports.issue_s] for _ in reports.lists.start]
+    def fuse(self, inputs: Inputs) -> Any:
+        return [[entries_of(0) for _ in inputs.issue_s] for _ in inputs.lists.start]
 
 
 class OfUnits(ListFusion):
@@ -155,8 +155,8 @@ class OfUnits(ListFusion):
 
     kind: str = "tests.fusion.test_testing:OfUnits"
 
-    def fuse(self, reports: Reports) -> Lists:
-        return reports.lists
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        return inputs.lists
 
 
 class Overlapping(ListFusion):
@@ -164,9 +164,9 @@ class Overlapping(ListFusion):
 
     kind: str = "tests.fusion.test_testing:Overlapping"
 
-    def fuse(self, reports: Reports) -> Lists:
-        fused = Union().fuse(reports)
-        return Lists(fused.start - fused.start[:, :1], fused.entries)
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        fused = Union().fuse(inputs)
+        return ObjectLists(fused.start - fused.start[:, :1], fused.entries)
 
 
 WRONG = [
@@ -196,7 +196,7 @@ def broken(fusion: ListFusion, rule: str, said: str, **options: Any) -> None:
     with pytest.raises(NonconformingError, match=said) as caught:
         check_fusion(fusion, **options)
     assert caught.value.rule == rule
-    assert str(caught.value).startswith(f"{fusion.kind} breaks the rule {rule!r}: {RULES[rule]}. ")
+    assert str(caught.value).startswith(f"{fusion.kind} breaks the rule {rule!r}: {FUSION_RULES[rule]}. ")
     assert "\n" not in str(caught.value)
 
 
@@ -208,27 +208,27 @@ class Altered(ListFusion):
 
     kind: str = "tests.fusion.test_testing:Altered"
 
-    def fuse(self, reports: Reports) -> Lists:
-        fused = Union().fuse(reports)
-        self.alter(fused.entries, reports)
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        fused = Union().fuse(inputs)
+        self.alter(fused.entries, inputs)
         return fused
 
-    def alter(self, entries: Entries, reports: Reports) -> None:
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
         raise NotImplementedError
 
 
 class ChangesEntries(Altered):
-    def alter(self, entries: Entries, reports: Reports) -> None:
-        reports.lists.entries["yaw_rad"] = 0.0
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
+        inputs.lists.entries["yaw_rad"] = 0.0
 
 
 class ChangesWhatIsNewest(Altered):
-    def alter(self, entries: Entries, reports: Reports) -> None:
-        reports.newest[:, 0] = -1
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
+        inputs.newest[:, 0] = -1
 
 
 class Draws(Altered):
-    def alter(self, entries: Entries, reports: Reports) -> None:
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
         entries["x_m"] += np.random.default_rng().normal(0.0, 1e-12, len(entries))
 
 
@@ -237,44 +237,44 @@ class CountsOnAndOn(Altered):
 
     count: ClassVar[Iterator[int]] = itertools.count()
 
-    def alter(self, entries: Entries, reports: Reports) -> None:
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
         entries["track_id"] = [next(self.count) for _ in entries]
 
 
 class DrawsInTurn(Altered):
     """The same numbers every time, but who gets which depends on the runs before."""
 
-    def alter(self, entries: Entries, reports: Reports) -> None:
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
         entries["x_m"] += np.random.default_rng(1).normal(0.0, 1.0, len(entries))
 
 
 class MeanOfRuns(Altered):
-    def alter(self, entries: Entries, reports: Reports) -> None:
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
         entries["z_m"] -= entries["z_m"].sum() / max(len(entries), 1)
 
 
 class OneInstantEarly(ListFusion):
     kind: str = "tests.fusion.test_testing:OneInstantEarly"
 
-    def fuse(self, reports: Reports) -> Lists:
-        early = Gnn().fuse(replace(reports, newest=np.concatenate([reports.newest[1:], reports.newest[-1:]])))
-        early.entries["captured_s"] = reports.captured_s[reports.arrived[:1]]
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        early = Gnn().fuse(replace(inputs, newest=np.concatenate([inputs.newest[1:], inputs.newest[-1:]])))
+        early.entries["captured_s"] = inputs.captured_s[inputs.arrived[:1]]
         return early
 
 
 class SureOfWhatEnds(Altered):
     """The longer the recording, the surer from its beginning."""
 
-    def alter(self, entries: Entries, reports: Reports) -> None:
-        entries["existence"] = 1 - 1 / (2 + len(reports.arrived))
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
+        entries["existence"] = 1 - 1 / (2 + len(inputs.arrived))
 
 
 class ByWhatIsLost(Altered):
     """Goes by what is in lists that never arrive."""
 
-    def alter(self, entries: Entries, reports: Reports) -> None:
-        lost = np.isinf(reports.arrives_s)
-        lengths = np.diff(reports.lists.start, axis=1)[:, lost]
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
+        lost = np.isinf(inputs.arrives_s)
+        lengths = np.diff(inputs.lists.start, axis=1)[:, lost]
         entries["z_m"] = (lengths > 6).any()
 
 
@@ -293,8 +293,8 @@ class AfterTheFact(StepFusion):
 class ShareOfUnits(Altered):
     """A share of all units of the experiment, heard or not."""
 
-    def alter(self, entries: Entries, reports: Reports) -> None:
-        entries["existence"] /= len(reports.units)
+    def alter(self, entries: Entries, inputs: Inputs) -> None:
+        entries["existence"] /= len(inputs.units)
 
 
 class FirstOfEachList(Plain):
@@ -332,17 +332,17 @@ class Silent(Plain):
 
 
 class ByTheOneBefore(ListFusion):
-    """Goes by the first list of each unit, which a later stretch has not."""
+    """Goes by the first list of each unit, which a later time chunk has not."""
 
     kind: str = "tests.fusion.test_testing:ByTheOneBefore"
     resumable: ClassVar[bool] = True
 
-    def fuse(self, reports: Reports) -> Lists:
-        fused = Plain().fuse(reports)
-        for s, k in np.ndindex(len(fused.start), len(reports.issue_s)):
-            came = reports.arrived[: reports.arrived_start[k + 1]]
-            first = came[reports.captured_s[came] == reports.captured_s[came].min()]
-            fused.of(s, k)["z_m"] = sum(len(reports.lists.of(s, f)) for f in first)
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        fused = Plain().fuse(inputs)
+        for s, k in np.ndindex(len(fused.start), len(inputs.issue_s)):
+            came = inputs.arrived[: inputs.arrived_start[k + 1]]
+            first = came[inputs.captured_s[came] == inputs.captured_s[came].min()]
+            fused.of(s, k)["z_m"] = sum(len(inputs.lists.of(s, f)) for f in first)
         return fused
 
 
@@ -355,25 +355,25 @@ class ForgetsOverACut(Plain):
         entries["z_m"] = memory
         return entries, memory
 
-    def resume(self, reports: Reports, memory: Any) -> tuple[Lists, Any]:
-        return super().resume(reports, None)[0], None
+    def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
+        return super().resume(inputs, None)[0], None
 
 
 class OnlyLists(Plain):
     """Gives no memory where one is asked for."""
 
-    def fuse(self, reports: Reports) -> Lists:
-        return Plain().fuse(reports)
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        return Plain().fuse(inputs)
 
     resumable: ClassVar[bool] = True
 
-    def resume(self, reports: Reports, memory: Any) -> Any:
-        return self.fuse(reports)
+    def resume(self, inputs: Inputs, memory: Any) -> Any:
+        return self.fuse(inputs)
 
 
 class FailsLater(OnlyLists):
-    def resume(self, reports: Reports, memory: Any) -> Any:
-        return self.fuse(reports), 1 / len(reports.issue_s)
+    def resume(self, inputs: Inputs, memory: Any) -> Any:
+        return self.fuse(inputs), 1 / len(inputs.issue_s)
 
 
 BROKEN = [
@@ -395,10 +395,10 @@ BROKEN = [
     (SureOfWhatEnds, "causality", "without what arrives after 0.* s', run 0, instant 0.* s: existence: expected "),
     (ByWhatIsLost, "causality", "what arrives after .* s spoiled', run 0, instant .* s: z_m: expected 0 .*, found 1"),
     (AfterTheFact, "causality", r"without what arrives after (.*) s', run 0, instant \1 s: x_m: expected "),
-    (ForgetsOverACut, "stretches", "one unit; instants in stretches', run 0, instant .* s: z_m: expected 2 .* found 1"),
-    (ByTheOneBefore, "stretches", "'.*; instants in stretches', run 0, instant .* s: z_m: expected .*, found "),
-    (OnlyLists, "stretches", "in stretches': resume: expected Lists and a memory, found Lists"),
-    (FailsLater, "stretches", r"expected Lists and a memory of instants\[0:0\], found ZeroDivisionError: "),
+    (ForgetsOverACut, "chunks", "one unit; instants in time chunks', run 0, instant .* s: z_m: expected 2 .* found 1"),
+    (ByTheOneBefore, "chunks", "'.*; instants in time chunks', run 0, instant .* s: z_m: expected .*, found "),
+    (OnlyLists, "chunks", "in time chunks': resume: expected ObjectLists and a memory, found ObjectLists"),
+    (FailsLater, "chunks", r"expected ObjectLists and a memory of instants\[0:0\], found ZeroDivisionError: "),
     (ShareOfUnits, "unheard", "one unit; and a unit that is not heard', run 0, instant .* s: existence: expected "),
     (FirstOfEachList, "order of entries", "entries shuffled and tracks renumbered', run 0, instant .*: expected "),
     (ByTheUnitsNumbers, "order of entries", "renumbered', run 0, instant .*: expected . entries .*, found "),
@@ -413,7 +413,7 @@ def test_a_broken_rule_is_named_and_placed(fusion: type[ListFusion], rule: str, 
 
 
 def test_every_rule_has_been_broken() -> None:
-    assert {rule for _, rule, _ in BROKEN} == RULES.keys() - {"answer"}
+    assert {rule for _, rule, _ in BROKEN} == FUSION_RULES.keys() - {"answer"}
 
 
 def test_the_order_of_units_may_matter_where_it_is_said_to() -> None:
@@ -440,11 +440,11 @@ def test_all_is_said_in_one_paragraph_of_an_assertion() -> None:
 class Keeps(Union):
     """All it has been told."""
 
-    told: ClassVar[list[Reports]] = []
+    told: ClassVar[list[Inputs]] = []
 
-    def fuse(self, reports: Reports) -> Lists:
-        self.told.append(reports)
-        return super().fuse(reports)
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        self.told.append(inputs)
+        return super().fuse(inputs)
 
 
 def test_the_scenes_hold_what_is_promised() -> None:

@@ -14,11 +14,11 @@ from pydantic import ValidationError
 from scipy.optimize import linear_sum_assignment
 
 from copem_replay.core.agree import AGREE, most_probable, most_probable_of_each
-from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES
 from copem_replay.fusion.base import fused_by
 from copem_replay.fusion.tracker import Tracker
-from tests.helpers.reports import entry, joined, lists_of, reports_of
+from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.oracles.gnn import largest_around
 
 Array = npt.NDArray[Any]
@@ -26,14 +26,14 @@ LATE = ("stale", "predict", "replay")
 AT_ONCE: dict[str, Any] = {"confirm_s": 0.0}
 
 
-def fuse(reports: Reports, **settings: Any) -> list[list[Entries]]:
+def fuse(inputs: Inputs, **settings: Any) -> list[list[Entries]]:
     """Fused lists [run][instant]; all that is asked of any fusion is checked."""
-    lists = fused_by(Tracker(**settings), reports, "fusion")
+    lists = fused_by(Tracker(**settings), inputs, "fusion")
     return [[lists.of(s, k) for k in range(lists.start.shape[1] - 1)] for s in range(len(lists.start))]
 
 
-def fuse_one(reports: Reports, **settings: Any) -> list[Entries]:
-    return fuse(reports, **settings)[0]
+def fuse_one(inputs: Inputs, **settings: Any) -> list[Entries]:
+    return fuse(inputs, **settings)[0]
 
 
 # ------------------------------------------------------------------------------------------- written out plainly
@@ -69,22 +69,22 @@ def in_order(entries: Entries) -> list[Any]:
 class Plain:
     """The tracker's rules, one after the other, with dictionaries and NumPy."""
 
-    def __init__(self, reports: Reports, run: int, settings: Tracker) -> None:
-        self.reports, self.run, self.of = reports, run, settings
+    def __init__(self, inputs: Inputs, run: int, settings: Tracker) -> None:
+        self.inputs, self.run, self.of = inputs, run, settings
         self.gate = -2 * math.log(1 - settings.gate)
         self.tracks: list[Track] = []
 
     def order(self, f: int) -> Any:
-        entries = in_order(self.reports.lists.of(self.run, f))
+        entries = in_order(self.inputs.lists.of(self.run, f))
         places = [(float(e["x_m"]), float(e["y_m"])) for e in entries]
-        return self.reports.captured_s[f], -len(entries), places
+        return self.inputs.captured_s[f], -len(entries), places
 
     def outruns(self, g: int, f: int) -> bool:
-        same_unit = self.reports.unit_ix[g] == self.reports.unit_ix[f]
-        return bool(same_unit and self.reports.captured_s[g] > self.reports.captured_s[f])
+        same_unit = self.inputs.unit_ix[g] == self.inputs.unit_ix[f]
+        return bool(same_unit and self.inputs.captured_s[g] > self.inputs.captured_s[f])
 
     def hear(self, f: int, now_s: float) -> None:
-        captured_s, unit = float(self.reports.captured_s[f]), int(self.reports.unit_ix[f])
+        captured_s, unit = float(self.inputs.captured_s[f]), int(self.inputs.unit_ix[f])
         q = self.of.acceleration_psd_m2ps3
         for track in self.tracks:
             dt = now_s - track.at_s
@@ -92,7 +92,7 @@ class Plain:
             Q = q * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
             track.x, track.P, track.at_s = F @ track.x, F @ track.P @ F.T + Q, now_s
         age = now_s - captured_s if self.of.late == "predict" else 0.0
-        entries = in_order(self.reports.lists.of(self.run, f))
+        entries = in_order(self.inputs.lists.of(self.run, f))
         z = [np.array([e["x_m"] + age * e["vx_mps"], e["y_m"] + age * e["vy_mps"]]) for e in entries]
         R = [
             np.array([[e["cov_ee_m2"], e["cov_en_m2"]], [e["cov_en_m2"], e["cov_nn_m2"]]]) + q * age**3 / 3 * np.eye(2)
@@ -176,18 +176,18 @@ class Plain:
     def follow(self) -> list[list[tuple[Any, ...]]]:
         """Published rows, instant after instant. `replay`: everything anew each time, in order of capture."""
         found = []
-        for k, now_s in enumerate(self.reports.issue_s.tolist()):
-            begin, end = self.reports.arrived_start[k : k + 2]
+        for k, now_s in enumerate(self.inputs.issue_s.tolist()):
+            begin, end = self.inputs.arrived_start[k : k + 2]
             if self.of.late == "replay":
                 self.tracks = []
-                heard = sorted(self.reports.arrived[:end].tolist(), key=self.order)
+                heard = sorted(self.inputs.arrived[:end].tolist(), key=self.order)
                 for n, f in enumerate(heard):
-                    captured_s = float(self.reports.captured_s[f])
+                    captured_s = float(self.inputs.captured_s[f])
                     self.hear(f, captured_s)
-                    if n + 1 == len(heard) or self.reports.captured_s[heard[n + 1]] > captured_s:
+                    if n + 1 == len(heard) or self.inputs.captured_s[heard[n + 1]] > captured_s:
                         self.settle(captured_s)
             else:
-                there = self.reports.arrived[:end].tolist()
+                there = self.inputs.arrived[:end].tolist()
                 for f in sorted(there[begin:], key=self.order):
                     if self.of.late == "predict" or not any(self.outruns(g, f) for g in there):
                         self.hear(f, now_s)
@@ -205,7 +205,7 @@ def rows_of(entries: Entries) -> list[tuple[Any, ...]]:
 
 def street(
     seed: int, *, runs: int = 1, units: int = 3, steps: int = 12, delay_s: float = 0.4, together: bool = True
-) -> Reports:
+) -> Inputs:
     """A small crowd of all sorts as units see it, late and with ghosts: all that can happen does, somewhere.
 
     Times are multiples of 1/64 s, so that sums are exact. `together`: units look at the same instants.
@@ -237,17 +237,17 @@ def street(
                 said.append(entry(*rng.uniform(-5.0, 20.0, 2), of="pedestrian", existence=0.6))
             lists.append(joined(*(said[i] for i in rng.permutation(len(said)))))
         by_run.append(lists)
-    return reports_of(by_run, whose, captured, arrives)
+    return inputs_of(by_run, whose, captured, arrives)
 
 
 @pytest.mark.parametrize("late", LATE)
 @pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_it_is_the_one_written_out_plainly(late: str, together: bool, seed: int):
-    reports = street(seed, runs=2, together=together)
+    inputs = street(seed, runs=2, together=together)
     settings = Tracker(late=late, forget_s=0.5, gate=0.99, drop=0.3, buffer_s=10.0)
-    for run, lists in enumerate(fuse(reports, **settings.model_dump())):
-        expected = Plain(reports, run, settings).follow()
+    for run, lists in enumerate(fuse(inputs, **settings.model_dump())):
+        expected = Plain(inputs, run, settings).follow()
         assert sum(map(len, expected)) > 20
         for found, rows in zip(lists, expected, strict=True):
             assert [row[:3] for row in rows_of(found)] == [row[:3] for row in rows]
@@ -258,10 +258,10 @@ def test_it_is_the_one_written_out_plainly(late: str, together: bool, seed: int)
 # --------------------------------------------------------------------------------- a list that comes out of sequence
 
 
-def late_measurement(apart_s: float = 2e-6) -> Reports:
+def late_measurement(apart_s: float = 2e-6) -> Inputs:
     """What was measured at 0.1 s arrives just after what was measured at 0.2 s."""
     lists = [entry(0.0, vx_mps=10.0), entry(1.2, vx_mps=10.0, cov=(0.25, 0, 0.25)), entry(2.1, cov=(0.25, 0, 0.25))]
-    return reports_of([lists], ["a", "b", "a"], [0.0, 0.1, 0.2], [0.0, 0.2 + apart_s, 0.2])
+    return inputs_of([lists], ["a", "b", "a"], [0.0, 0.1, 0.2], [0.0, 0.2 + apart_s, 0.2])
 
 
 PRIOR: dict[str, Any] = {"speed_sigma_mps": 2.0, "acceleration_psd_m2ps3": 1.0, "confirm_s": 0.0}
@@ -292,16 +292,16 @@ def test_the_exact_covariance_and_what_it_grows_to_until_now():
 
 def test_a_late_entry_is_moved_to_now_by_its_own_velocity():
     # Alone, so that the filter has nothing to add: 0.5 s at (4, −2) m/s, R grows by q · 0.5³ / 3.
-    reports = reports_of([[entry(1.0, 2.0, vx_mps=4.0, vy_mps=-2.0, cov=(0.5, 0.1, 0.25))]], ["a"], [1.0], [1.5])
-    (one,) = fuse_one(reports, late="predict", acceleration_psd_m2ps3=0.6, **AT_ONCE)[0]
+    inputs = inputs_of([[entry(1.0, 2.0, vx_mps=4.0, vy_mps=-2.0, cov=(0.5, 0.1, 0.25))]], ["a"], [1.0], [1.5])
+    (one,) = fuse_one(inputs, late="predict", acceleration_psd_m2ps3=0.6, **AT_ONCE)[0]
     assert (one["x_m"], one["y_m"], one["vx_mps"], one["vy_mps"]) == pytest.approx((3.0, 1.0, 4.0, -2.0))
     assert (one["cov_ee_m2"], one["cov_en_m2"], one["cov_nn_m2"]) == pytest.approx((0.525, 0.1, 0.275))
     assert one["captured_s"] == 1.0
     assert one["existence"] == pytest.approx(math.exp(-0.5))
-    (stale,) = fuse_one(reports, late="stale", **AT_ONCE)[0]
+    (stale,) = fuse_one(inputs, late="stale", **AT_ONCE)[0]
     assert (stale["x_m"], stale["y_m"], stale["cov_ee_m2"], stale["existence"]) == pytest.approx((1.0, 2.0, 0.5, 1.0))
     # Heard at its capture: the track itself is what moves on, its speed unsure by 3 m/s, and the claim is 0.5 s old.
-    (replayed,) = fuse_one(reports, late="replay", acceleration_psd_m2ps3=0.6, publish=0.1, **AT_ONCE)[0]
+    (replayed,) = fuse_one(inputs, late="replay", acceleration_psd_m2ps3=0.6, publish=0.1, **AT_ONCE)[0]
     assert (replayed["x_m"], replayed["y_m"]) == pytest.approx((3.0, 1.0))
     assert replayed["cov_ee_m2"] == pytest.approx(0.5 + 0.25 * 9.0 + 0.025)
     assert replayed["existence"] == pytest.approx(math.exp(-0.5))
@@ -315,8 +315,8 @@ def test_replayed_it_does_not_matter_in_which_order_lists_came(seed: int):
     units = [out_of_order.units[u] for u in out_of_order.unit_ix] + ["last"]
     captured_s = [*out_of_order.captured_s.tolist(), 3.0]
     settings = {"late": "replay", "buffer_s": 4.0, "publish": 0.05}
-    late = fuse_one(reports_of(lists, units, captured_s, [*out_of_order.arrives_s, 3.0]), **settings)
-    timely = fuse_one(reports_of(lists, units, captured_s, captured_s), **settings)
+    late = fuse_one(inputs_of(lists, units, captured_s, [*out_of_order.arrives_s, 3.0]), **settings)
+    timely = fuse_one(inputs_of(lists, units, captured_s, captured_s), **settings)
     assert (np.diff(out_of_order.captured_s[out_of_order.arrived]) < 0).any()
     assert len(timely[-1]) > 0
     assert late[-1].tobytes() == timely[-1].tobytes()
@@ -327,8 +327,8 @@ def test_replayed_what_was_only_listed_later_is_not_known_yet():
     lists = [[entry(0.0, vx_mps=8.0), entry(7.0), joined(entry(8.0), entry(7.0)), entries_of(0), entries_of(0)]]
     captured_s = [0.0, 0.0, 1.0, 0.875, 1.25]
     settings = {"late": "replay", "publish": 0.2, **AT_ONCE}
-    late = fuse_one(reports_of(lists, list("abcde"), captured_s, [0.0, 0.0, 1.0, 1.125, 1.25]), **settings)
-    timely = fuse_one(reports_of(lists, list("abcde"), captured_s, captured_s), **settings)
+    late = fuse_one(inputs_of(lists, list("abcde"), captured_s, [0.0, 0.0, 1.0, 1.125, 1.25]), **settings)
+    timely = fuse_one(inputs_of(lists, list("abcde"), captured_s, captured_s), **settings)
     assert sorted(late[1]["track_id"] // 65536) == [0, 1]
     assert sorted(late[-1]["track_id"] // 65536) == [0, 2]
     assert late[-1].tobytes() == timely[-1].tobytes()
@@ -336,49 +336,47 @@ def test_replayed_what_was_only_listed_later_is_not_known_yet():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_replayed_lists_that_are_too_old_are_as_if_they_were_empty(seed: int):
-    reports = street(seed, delay_s=0.8)
+    inputs = street(seed, delay_s=0.8)
     newest_s, too_old = -math.inf, []
-    for k in range(len(reports.issue_s)):
-        came = reports.arrived[reports.arrived_start[k] : reports.arrived_start[k + 1]]
-        too_old += [int(f) for f in came if reports.captured_s[f] < newest_s - 0.25 - 1e-6]
-        newest_s = max(newest_s, *reports.captured_s[came].tolist())
+    for k in range(len(inputs.issue_s)):
+        came = inputs.arrived[inputs.arrived_start[k] : inputs.arrived_start[k + 1]]
+        too_old += [int(f) for f in came if inputs.captured_s[f] < newest_s - 0.25 - 1e-6]
+        newest_s = max(newest_s, *inputs.captured_s[came].tolist())
     assert len(too_old) > 3
-    lists = [entries_of(0) if f in too_old else reports.lists.of(0, f) for f in range(len(reports.captured_s))]
-    without = replace(reports, lists=lists_of([lists]))
-    found = fuse_one(reports, late="replay", buffer_s=0.25)
+    lists = [entries_of(0) if f in too_old else inputs.lists.of(0, f) for f in range(len(inputs.captured_s))]
+    without = replace(inputs, lists=lists_of([lists]))
+    found = fuse_one(inputs, late="replay", buffer_s=0.25)
     expected = fuse_one(without, late="replay", buffer_s=0.25)
     assert [one.tobytes() for one in found] == [one.tobytes() for one in expected]
     assert sum(map(len, found)) > 20
-    kept = fuse_one(reports, late="replay", buffer_s=4.0)
+    kept = fuse_one(inputs, late="replay", buffer_s=4.0)
     assert [one.tobytes() for one in found] != [one.tobytes() for one in kept]
 
 
 # --------------------------------------------------------------------------------------- what may not change anything
 
 
-def shuffled(reports: Reports, seed: int) -> tuple[Reports, list[int]]:
+def shuffled(inputs: Inputs, seed: int) -> tuple[Inputs, list[int]]:
     """Units numbered otherwise, their lists too, and the entries of each in another order; new number of each unit."""
     rng = np.random.default_rng(seed)
-    number = rng.permutation(len(reports.units)).tolist()
-    names = [reports.units[number.index(u)] for u in range(len(reports.units))]
-    order = rng.permutation(len(reports.captured_s)).tolist()
+    number = rng.permutation(len(inputs.units)).tolist()
+    names = [inputs.units[number.index(u)] for u in range(len(inputs.units))]
+    order = rng.permutation(len(inputs.captured_s)).tolist()
     by_run = []
-    for s in range(len(reports.lists.start)):
-        lists = [reports.lists.of(s, f) for f in order]
+    for s in range(len(inputs.lists.start)):
+        lists = [inputs.lists.of(s, f) for f in order]
         by_run.append([one[rng.permutation(len(one))] for one in lists])
-    whose = [reports.units[reports.unit_ix[f]] for f in order]
-    other = reports_of(
-        by_run, whose, reports.captured_s[order].tolist(), reports.arrives_s[order].tolist(), names=names
-    )
+    whose = [inputs.units[inputs.unit_ix[f]] for f in order]
+    other = inputs_of(by_run, whose, inputs.captured_s[order].tolist(), inputs.arrives_s[order].tolist(), names=names)
     return other, number
 
 
 @pytest.mark.parametrize("late", LATE)
 def test_neither_the_order_of_units_nor_of_entries_matters(late: str):
-    reports = street(5, runs=2)
-    other, number = shuffled(reports, 6)
+    inputs = street(5, runs=2)
+    other, number = shuffled(inputs, 6)
     renamed: dict[tuple[int, int], int] = {}
-    for s, (lists, others) in enumerate(zip(fuse(reports, late=late), fuse(other, late=late), strict=True)):
+    for s, (lists, others) in enumerate(zip(fuse(inputs, late=late), fuse(other, late=late), strict=True)):
         assert sum(map(len, lists)) > 20
         for one, two in zip(lists, others, strict=True):
             two = two.copy()
@@ -397,8 +395,8 @@ def test_neither_the_order_of_units_nor_of_entries_matters(late: str):
 def test_units_that_say_exactly_the_same_can_be_exchanged(late: str):
     twins = [joined(entry(3.0, 1.0), entry(3.0, 1.0, vx_mps=2.0)), joined(entry(3.0, 1.0, vx_mps=2.0), entry(3.0, 1.0))]
     times = [0.0, 0.0, 0.125, 0.125]
-    found = fuse_one(reports_of([twins * 2], ["a", "b"] * 2, times, times), late=late)
-    other = fuse_one(reports_of([twins[::-1] * 2], ["b", "a"] * 2, times, times), late=late)
+    found = fuse_one(inputs_of([twins * 2], ["a", "b"] * 2, times, times), late=late)
+    other = fuse_one(inputs_of([twins[::-1] * 2], ["b", "a"] * 2, times, times), late=late)
     for one, two in zip(found, other, strict=True):
         for name in ("x_m", "y_m", "vx_mps", "vy_mps", "existence"):
             assert one[name].tolist() == two[name].tolist()
@@ -407,34 +405,34 @@ def test_units_that_say_exactly_the_same_can_be_exchanged(late: str):
 
 @pytest.mark.parametrize("late", LATE)
 def test_a_run_alone_is_the_run_in_a_batch(late: str):
-    reports = street(7, runs=3)
-    batch = fuse(reports, late=late)
+    inputs = street(7, runs=3)
+    batch = fuse(inputs, late=late)
     for s in range(3):
-        count = len(reports.captured_s)
-        alone = replace(reports, lists=lists_of([[reports.lists.of(s, f) for f in range(count)]]))
+        count = len(inputs.captured_s)
+        alone = replace(inputs, lists=lists_of([[inputs.lists.of(s, f) for f in range(count)]]))
         assert [one.tobytes() for one in fuse_one(alone, late=late)] == [one.tobytes() for one in batch[s]]
 
 
 @pytest.mark.parametrize("late", LATE)
 def test_nothing_depends_on_what_arrives_later(late: str):
-    reports = street(8)
-    cut = len(reports.issue_s) // 2
-    entries = reports.lists.entries.copy()
-    for f in reports.arrived[reports.arrived_start[cut] :]:
-        mine = entries[reports.lists.start[0, f] : reports.lists.start[0, f + 1]]
+    inputs = street(8)
+    cut = len(inputs.issue_s) // 2
+    entries = inputs.lists.entries.copy()
+    for f in inputs.arrived[inputs.arrived_start[cut] :]:
+        mine = entries[inputs.lists.start[0, f] : inputs.lists.start[0, f + 1]]
         mine["x_m"], mine["y_m"], mine["existence"] = -mine["x_m"], 1e3, 0.3
-    spoilt = replace(reports, lists=Lists(reports.lists.start, entries))
-    found, other = fuse_one(reports, late=late), fuse_one(spoilt, late=late)
+    spoilt = replace(inputs, lists=ObjectLists(inputs.lists.start, entries))
+    found, other = fuse_one(inputs, late=late), fuse_one(spoilt, late=late)
     assert [one.tobytes() for one in found[:cut]] == [one.tobytes() for one in other[:cut]]
     assert sum(map(len, found[:cut])) > 10
     assert found[-1].tobytes() != other[-1].tobytes()
 
 
 def test_what_goes_in_is_left_as_it_is():
-    reports = street(9)
-    before = reports.lists.entries.copy()
-    fuse(reports, late="replay")
-    assert reports.lists.entries.tobytes() == before.tobytes()
+    inputs = street(9)
+    before = inputs.lists.entries.copy()
+    fuse(inputs, late="replay")
+    assert inputs.lists.entries.tobytes() == before.tobytes()
 
 
 # ------------------------------------------------------------------------------------------------ existence, in time
@@ -445,7 +443,7 @@ def seen_at(times_s: Sequence[float], looks_s: Sequence[float], **more: Any) -> 
     lists = [entry(5.0, 5.0, **more) for _ in times_s] + [entries_of(0) for _ in looks_s]
     units = ["seer"] * len(times_s) + ["blind"] * len(looks_s)
     times = [*times_s, *looks_s]
-    return fuse_one(reports_of([lists], units, times, times, names=["seer", "blind"]), publish=0.0, drop=0.0)
+    return fuse_one(inputs_of([lists], units, times, times, names=["seer", "blind"]), publish=0.0, drop=0.0)
 
 
 def test_existence_does_not_depend_on_the_rate_of_lists():
@@ -460,17 +458,17 @@ def test_existence_does_not_depend_on_the_rate_of_lists():
 def test_units_claim_independently_each_with_its_own_age(late: str):
     lists = [[entry(0.0, existence=0.2), entry(0.1, existence=0.6), entry(0.0, existence=0.5), entries_of(0)]]
     times = [0.0, 0.5, 0.75, 1.0]
-    reports = reports_of(lists, ["a", "a", "b", "b"], times, times)
-    (one,) = fuse_one(reports, late=late, forget_s=0.5, publish=0.2)[-1]
+    inputs = inputs_of(lists, ["a", "a", "b", "b"], times, times)
+    (one,) = fuse_one(inputs, late=late, forget_s=0.5, publish=0.2)[-1]
     expected = 1 - (1 - 0.6 * math.exp(-1.0)) * (1 - 0.5 * math.exp(-0.5))
     assert one["existence"] == pytest.approx(expected, abs=1e-12)
 
 
 def test_existence_fades_from_capture_and_stale_from_arrival():
     # Captured at 0, there at 1.5 s, looked at again at 2 s. Taken for the present it is of 1.5 s.
-    reports = reports_of([[entry(0.0, existence=0.9), entries_of(0)]], ["a", "b"], [0.0, 2.0], [1.5, 2.0])
+    inputs = inputs_of([[entry(0.0, existence=0.9), entries_of(0)]], ["a", "b"], [0.0, 2.0], [1.5, 2.0])
     for late, ages_s in (("stale", (0.0, 0.5)), ("predict", (1.5, 2.0)), ("replay", (1.5, 2.0))):
-        found = fuse_one(reports, late=late, publish=0.05, **AT_ONCE)
+        found = fuse_one(inputs, late=late, publish=0.05, **AT_ONCE)
         claimed = [one["existence"][0] for one in found]
         assert claimed == pytest.approx(
             [0.9 * math.exp(-age_of_information_s) for age_of_information_s in ages_s], abs=1e-12
@@ -481,7 +479,7 @@ def test_existence_fades_from_capture_and_stale_from_arrival():
 def test_an_older_list_does_not_override_what_its_unit_said_later(late: str):
     # What a captured at 0.2 s is there at once; what it captured at 0.1 s comes at 0.3 s.
     lists = [[entry(0.0, existence=0.9, yaw_rad=1.0), entry(1.0, existence=0.3, yaw_rad=2.0)]]
-    (one,) = fuse_one(reports_of(lists, ["a", "a"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
+    (one,) = fuse_one(inputs_of(lists, ["a", "a"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
     assert one["existence"] == pytest.approx(0.9 * math.exp(-0.1), abs=1e-12)
     assert (one["yaw_rad"], one["captured_s"]) == (1.0, 0.2)
     # Its place is of use where it is not taken for a present one.
@@ -491,7 +489,7 @@ def test_an_older_list_does_not_override_what_its_unit_said_later(late: str):
 @pytest.mark.parametrize("late", LATE)
 def test_another_units_older_list_counts(late: str):
     lists = [[entry(0.0, existence=0.9), entry(1.0, existence=0.3)]]
-    (one,) = fuse_one(reports_of(lists, ["a", "b"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
+    (one,) = fuse_one(inputs_of(lists, ["a", "b"], [0.2, 0.1], [0.2, 0.3]), late=late, publish=0.1, **AT_ONCE)[-1]
     age_of_information_s = 0.0 if late == "stale" else 0.2
     expected = 1 - (1 - 0.9 * math.exp(-0.1)) * (1 - 0.3 * math.exp(-age_of_information_s))
     assert one["existence"] == pytest.approx(expected, abs=1e-12)
@@ -500,42 +498,42 @@ def test_another_units_older_list_counts(late: str):
 
 def test_what_only_the_older_list_holds_is_known_from_its_capture_and_not_to_stale():
     lists = [[entry(0.0, existence=0.9), entry(50.0, existence=0.8)]]
-    reports = reports_of(lists, ["a", "a"], [0.2, 0.1], [0.2, 0.3])
-    assert fuse_one(reports, late="stale", **AT_ONCE)[-1]["x_m"].tolist() == [0.0]
+    inputs = inputs_of(lists, ["a", "a"], [0.2, 0.1], [0.2, 0.3])
+    assert fuse_one(inputs, late="stale", **AT_ONCE)[-1]["x_m"].tolist() == [0.0]
     for late in ("predict", "replay"):
-        found = np.sort(fuse_one(reports, late=late, **AT_ONCE)[-1], order="x_m")
+        found = np.sort(fuse_one(inputs, late=late, **AT_ONCE)[-1], order="x_m")
         assert found["x_m"].tolist() == [0.0, 50.0]
         assert found["existence"] == pytest.approx([0.9 * math.exp(-0.1), 0.8 * math.exp(-0.2)], abs=1e-12)
 
 
 def test_of_two_lists_of_a_unit_that_come_together_stale_takes_the_newer():
     lists = [[entry(4.0, existence=0.3), entry(0.0, existence=0.9)]]
-    (one,) = fuse_one(reports_of(lists, ["a", "a"], [0.1, 0.2], [0.3, 0.3]), late="stale", **AT_ONCE)[-1]
+    (one,) = fuse_one(inputs_of(lists, ["a", "a"], [0.1, 0.2], [0.3, 0.3]), late="stale", **AT_ONCE)[-1]
     assert (one["x_m"], one["existence"], one["captured_s"]) == (0.0, 0.9, 0.2)
 
 
 def test_a_track_is_confirmed_by_the_time_between_its_lists_not_by_their_number():
     times = [0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.12]
     lists = [[entry(0.0) for _ in times]]
-    held = [len(one) for one in fuse_one(reports_of(lists, ["a"] * 7, times, times), confirm_s=0.1)]
+    held = [len(one) for one in fuse_one(inputs_of(lists, ["a"] * 7, times, times), confirm_s=0.1)]
     assert held == [0, 0, 0, 0, 0, 1, 1]
-    assert [len(one) for one in fuse_one(reports_of(lists, ["a"] * 7, times, times), **AT_ONCE)] == [1] * 7
+    assert [len(one) for one in fuse_one(inputs_of(lists, ["a"] * 7, times, times), **AT_ONCE)] == [1] * 7
     # Two units at the same instant are one look.
-    both = reports_of([[entry(0.0), entry(0.0)]], ["a", "b"], [0.0, 0.0], [0.0, 0.0])
+    both = inputs_of([[entry(0.0), entry(0.0)]], ["a", "b"], [0.0, 0.0], [0.0, 0.0])
     assert len(fuse_one(both, confirm_s=0.1)[0]) == 0
 
 
 def test_captures_confirm_not_arrivals():
-    reports = reports_of([[entry(0.0), entry(0.0)]], ["a", "b"], [0.0, 0.05], [0.5, 1.0])
-    assert [len(one) for one in fuse_one(reports, late="stale", confirm_s=0.1)] == [0, 0]
-    assert [len(one) for one in fuse_one(reports, late="stale", confirm_s=0.05)] == [0, 1]
+    inputs = inputs_of([[entry(0.0), entry(0.0)]], ["a", "b"], [0.0, 0.05], [0.5, 1.0])
+    assert [len(one) for one in fuse_one(inputs, late="stale", confirm_s=0.1)] == [0, 0]
+    assert [len(one) for one in fuse_one(inputs, late="stale", confirm_s=0.05)] == [0, 1]
 
 
 def test_a_track_fades_out_of_the_list_and_then_out_of_memory():
     def held(*looks_s: float) -> list[Entries]:
         lists = [[entry(0.0, existence=0.8), *(entries_of(0) for _ in looks_s), entry(0.0, existence=0.8)]]
         times = [0.0, *looks_s, looks_s[-1] + 1e-3]
-        return fuse_one(reports_of(lists, ["a"] * len(times), times, times), **AT_ONCE)
+        return fuse_one(inputs_of(lists, ["a"] * len(times), times, times), **AT_ONCE)
 
     # Published above a half, which 0.8 is down to at ln 1.6; forgotten at 0.05, at ln 16.
     published_s, forgotten_s = math.log(1.6), math.log(16.0)
@@ -556,7 +554,7 @@ def test_two_close_objects_are_kept_apart_where_a_unit_lists_both():
     for _ in times:
         both = [entry(*rng.normal((0.0, place), 0.4), cov=(0.16, 0.0, 0.16)) for place in (0.0, 1.0)]
         lists.append(joined(*(one for one in both if rng.random() < 0.7)))
-    found = fuse_one(reports_of([lists], ["a"] * 40, times, times), publish=0.1)
+    found = fuse_one(inputs_of([lists], ["a"] * 40, times, times), publish=0.1)
     assert {len(one) for one in found[8:]} == {2}
     assert len({i for one in found[8:] for i in one["track_id"].tolist()}) == 2
 
@@ -566,8 +564,8 @@ def converging(units: Sequence[str]) -> list[Entries]:
     apart = [entry(0.0, vx_mps=7.0 / 0.875), entry(7.0)]
     lists = [joined(*apart)] if len(units) == 1 else apart
     times = [0.0] * len(units) + [0.25, 0.875, 1.25]
-    reports = reports_of([[*lists, *[entries_of(0)] * 3]], [*units, *["blind"] * 3], times, times)
-    return fuse_one(reports, publish=0.2, **AT_ONCE)
+    inputs = inputs_of([[*lists, *[entries_of(0)] * 3]], [*units, *["blind"] * 3], times, times)
+    return fuse_one(inputs, publish=0.2, **AT_ONCE)
 
 
 @pytest.mark.parametrize("sigma_m", [None, 0.5, 2.0, 10.0, 100.0])
@@ -575,7 +573,7 @@ def test_who_is_who_here_does_not_depend_on_what_is_far_away(sigma_m: float | No
     # The second list says 0.2 and −3.9 of tracks at 0 and 4: 0.2 is far more likely the first, though −3.9 is then new.
     far = [] if sigma_m is None else [entry(500.0, of="truck", cov=(sigma_m**2, 0.0, sigma_m**2))]
     lists = [[joined(*(entry(x, of="pedestrian") for x in xs), *far) for xs in ((0.0, 4.0), (0.2, -3.9))]]
-    found = fuse_one(reports_of(lists, ["a", "b"], [0.0, 0.01], [0.0, 0.01]), gate=0.99, **AT_ONCE)[-1]
+    found = fuse_one(inputs_of(lists, ["a", "b"], [0.0, 0.01], [0.0, 0.01]), gate=0.99, **AT_ONCE)[-1]
     here = np.sort(found["x_m"][found["x_m"] < 100.0])
     assert here == pytest.approx([-3.9, 0.1, 4.0], abs=1e-3)
 
@@ -595,14 +593,14 @@ def test_of_two_tracks_of_one_list_none_ends_before_that_is_forgotten():
 
 def test_the_track_first_seen_later_ends_whoever_arrived_first():
     lists = [[entry(7.0), entry(0.0, vx_mps=8.0), entries_of(0)]]
-    reports = reports_of(lists, ["a", "b", "c"], [0.125, 0.0, 1.0], [0.125, 0.25, 1.0])
-    (left,) = fuse_one(reports, late="stale", publish=0.2, **AT_ONCE)[-1]
+    inputs = inputs_of(lists, ["a", "b", "c"], [0.125, 0.0, 1.0], [0.125, 0.25, 1.0])
+    (left,) = fuse_one(inputs, late="stale", publish=0.2, **AT_ONCE)[-1]
     assert left["unit_ix"] == 1
 
 
 def test_tracks_of_classes_that_do_not_agree_are_never_one():
     lists = [[entry(0.0, of="car"), entry(0.0, of="pedestrian"), entry(0.0, of="vehicle"), entry(0.0, of="other")]]
-    found = fuse_one(reports_of(lists, list("abcd"), [0.0] * 4, [0.0] * 4), **AT_ONCE)
+    found = fuse_one(inputs_of(lists, list("abcd"), [0.0] * 4, [0.0] * 4), **AT_ONCE)
     # The vehicle is the car; the other is one of both.
     assert len(found[0]) == 2
     assert sorted(np.round(found[0]["cov_ee_m2"], 6).tolist()) in ([0.333333, 1.0], [0.5, 0.5])
@@ -612,7 +610,7 @@ def test_many_units_do_not_split_an_object_in_two():
     rng = np.random.default_rng(2)
     times = np.repeat(np.arange(80) / 8, 10).tolist()
     lists = [[entry(*rng.normal(0.0, 1.0, 2)) for _ in times]]
-    found = fuse_one(reports_of(lists, [f"u{k}" for k in range(10)] * 80, times, times))
+    found = fuse_one(inputs_of(lists, [f"u{k}" for k in range(10)] * 80, times, times))
     counts = [len(one) for one in found[1:]]
     assert counts.count(1) > 0.8 * len(counts)
     assert max(counts) <= 2
@@ -651,11 +649,11 @@ def test_classes_that_agree():
 def test_yaw_is_the_newest_captured_and_wrapped():
     turns = [3.5, 0.2, -9.0]
     lists = [[entry(0.0, yaw_rad=yaw, z_m=yaw) for yaw in turns]]
-    found = fuse_one(reports_of(lists, ["a"] * 3, [0.0, 0.2, 0.1], [0.0, 0.2, 0.3]), late="stale", **AT_ONCE)
+    found = fuse_one(inputs_of(lists, ["a"] * 3, [0.0, 0.2, 0.1], [0.0, 0.2, 0.3]), late="stale", **AT_ONCE)
     assert [one["yaw_rad"][0] for one in found] == pytest.approx([3.5 - 2 * math.pi, 0.2, 0.2])
     assert found[-1]["z_m"] == [0.2]
     assert found[-1]["captured_s"] == [0.2]
-    (one,) = fuse_one(reports_of([[entry(0.0, yaw_rad=-9.0)]], ["a"], [0.0], [0.0]), **AT_ONCE)
+    (one,) = fuse_one(inputs_of([[entry(0.0, yaw_rad=-9.0)]], ["a"], [0.0], [0.0]), **AT_ONCE)
     assert one["yaw_rad"] == pytest.approx(-9.0 + 2 * math.pi)
 
 
@@ -665,7 +663,7 @@ def test_sizes_and_classes_are_means_and_the_founder_is_named():
     lists = [
         [entry(0.0, length_m=4.0, class_probability=kinds[0]), entry(0.0, length_m=5.0, class_probability=kinds[1])]
     ]
-    (one,) = fuse_one(reports_of(lists, ["a", "b"], [0.1, 0.0], [0.1, 0.0], names=["z", "a", "b"]))[-1]
+    (one,) = fuse_one(inputs_of(lists, ["a", "b"], [0.1, 0.0], [0.1, 0.0], names=["z", "a", "b"]))[-1]
     assert (one["length_m"], one["width_m"], one["height_m"]) == pytest.approx((4.5, 2.0, 1.5))
     assert one["class_probability"] == pytest.approx(kinds.mean(axis=0))
     assert (one["unit_ix"], one["track_id"]) == (2, 65536)
@@ -673,34 +671,34 @@ def test_sizes_and_classes_are_means_and_the_founder_is_named():
 
 def test_nothing_said_of_the_class_agrees_with_all():
     lists = [[entry(0.0, of="pedestrian"), entry(0.0, class_probability=np.zeros(len(CLASSES)))]]
-    (one,) = fuse_one(reports_of(lists, ["a", "b"], [0.0, 0.0], [0.0, 0.0]), **AT_ONCE)[0]
+    (one,) = fuse_one(inputs_of(lists, ["a", "b"], [0.0, 0.0], [0.0, 0.0]), **AT_ONCE)[0]
     assert one["class_probability"][CLASSES.index("pedestrian")] == 1.0
-    (one,) = fuse_one(reports_of([lists[0][1:]], ["b"], [0.0], [0.0]), **AT_ONCE)[0]
+    (one,) = fuse_one(inputs_of([lists[0][1:]], ["b"], [0.0], [0.0]), **AT_ONCE)[0]
     assert one["class_probability"].tolist() == [0.0] * len(CLASSES)
 
 
 def test_exact_lists_are_taken_as_exact_as_the_smallest_variance_allows():
     lists = [[entry(3.0 + 0.1 * k, cov=(0.0, 0.0, 0.0)) for k in range(5)]]
     times = [0.1 * k for k in range(5)]
-    (one,) = fuse_one(reports_of(lists, ["a"] * 5, times, times))[-1]
+    (one,) = fuse_one(inputs_of(lists, ["a"] * 5, times, times))[-1]
     assert one["x_m"] == pytest.approx(3.4, abs=1e-6)
     assert 0 < one["cov_ee_m2"] <= 1e-9
 
 
 def test_nothing_heard_nothing_said():
-    nothing = reports_of([[], []], [], [], [], names=["a"])
+    nothing = inputs_of([[], []], [], [], [], names=["a"])
     lists = fused_by(Tracker(), nothing, "fusion")
     assert lists.start.tolist() == [[0], [0]]
     assert len(lists.entries) == 0
     for late in LATE:
-        empty = reports_of([[entries_of(0)] * 3] * 2, ["a"] * 3, [0.0, 0.1, 0.2], [0.0, 0.3, 0.2])
+        empty = inputs_of([[entries_of(0)] * 3] * 2, ["a"] * 3, [0.0, 0.1, 0.2], [0.0, 0.3, 0.2])
         assert [[len(one) for one in run] for run in fuse(empty, late=late)] == [[0, 0, 0]] * 2
 
 
 # ----------------------------------------------------------------------------------------------- how good it is
 
 
-def walks(runs: int, q: float, sigma: float) -> tuple[Reports, Array]:
+def walks(runs: int, q: float, sigma: float) -> tuple[Inputs, Array]:
     """One object per run that moves as the filter assumes, listed at 10 Hz; where it is in the end (runs, 2)."""
     rng = np.random.default_rng(4)
     step, steps = 0.1, 50
@@ -716,12 +714,12 @@ def walks(runs: int, q: float, sigma: float) -> tuple[Reports, Array]:
         for s in range(runs):
             by_run[s].append(entry(*listed[s], vx_mps=told[s, 0], vy_mps=told[s, 1], cov=(sigma**2, 0.0, sigma**2)))
     times = [step * k for k in range(steps)]
-    return reports_of(by_run, ["a"] * steps, times, times), place
+    return inputs_of(by_run, ["a"] * steps, times, times), place
 
 
 def test_its_errors_are_as_large_as_it_says():
-    reports, place = walks(100, 1.0, 0.5)
-    found = [run[-1] for run in fuse(reports, gate=0.999999)]
+    inputs, place = walks(100, 1.0, 0.5)
+    found = [run[-1] for run in fuse(inputs, gate=0.999999)]
     assert {len(one) for one in found} == {1}
     squares = []
     for (one,), truth in zip(found, place, strict=True):
@@ -733,8 +731,8 @@ def test_its_errors_are_as_large_as_it_says():
 
 
 def test_what_moves_at_constant_velocity_is_tracked_better_than_it_is_measured():
-    reports, place = walks(60, 1e-3, 0.5)
-    found = [run[-1] for run in fuse(reports, acceleration_psd_m2ps3=0.01)]
+    inputs, place = walks(60, 1e-3, 0.5)
+    found = [run[-1] for run in fuse(inputs, acceleration_psd_m2ps3=0.01)]
     errors = [[one["x_m"][0], one["y_m"][0]] - truth for one, truth in zip(found, place, strict=True)]
     assert np.sqrt(np.mean(np.square(errors))) < 0.25
 
@@ -765,5 +763,5 @@ def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any]):
 def test_published_is_what_is_claimed_above_the_threshold(late: str):
     # Looked at when it was said, nothing has faded: 1 − (1 − 0.5) is exactly a half.
     for claimed, count in ((0.5, 0), (0.5 + 1e-12, 1)):
-        reports = reports_of([[entry(0.0, existence=claimed)]], ["a"], [0.0], [0.0])
-        assert len(fuse_one(reports, late=late, publish=0.5, **AT_ONCE)[0]) == count
+        inputs = inputs_of([[entry(0.0, existence=claimed)]], ["a"], [0.0], [0.0])
+        assert len(fuse_one(inputs, late=late, publish=0.5, **AT_ONCE)[0]) == count

@@ -1,52 +1,54 @@
-"""All lists at once, through what takes them stretch by stretch."""
+"""All lists at once, through what takes them chunk by chunk."""
 
 from __future__ import annotations
 
-from copem_replay.core.object_list import Lists
+from copem_replay.core.object_list import ObjectLists
 from copem_replay.core.tracks import Bool, Float, Scene, Tracks
-from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps
 from copem_replay.metrics.detection.by_truth_id import Detections
-from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.episodes import Episodes
 from copem_replay.metrics.matching import Matches
 from copem_replay.metrics.reference import Reference
 
 
 def assess(
-    lists: Lists,
+    lists: ObjectLists,
     about: Matches,
     now: Matches,
     issue_s: Float,
     world: Tracks,
     scene: Scene,
-    looks: Looks,
+    episodes: Episodes,
     stay_from_s: Float,
     reference: Reference,
     measured_class: Bool,
     *,
     settings: Settings,
 ) -> Accuracy:
-    """Add up how far off all lists are at once: what `Assessment` is given."""
-    whole = Assessment(
-        issue_s, scene, looks, stay_from_s, reference, measured_class, settings=settings, runs=len(lists.start)
+    """Add up how far off all lists are at once: what `Aggregator` is given."""
+    whole = Aggregator(
+        issue_s, scene, episodes, stay_from_s, reference, measured_class, settings=settings, runs=len(lists.start)
     )
     whole.add(lists, about, now, world)
     return whole.result()
 
 
 def first_matches(
-    lists: Lists,
+    lists: ObjectLists,
     matches: Matches,
     issue_s: Float,
-    looks: Looks,
+    episodes: Episodes,
     *,
     confirm: Confirm,
     count_earlier: bool,
     captures: Captures,
 ) -> tuple[Detections, Steps]:
     """The same of all lists at once."""
-    whole = FirstMatches(looks, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, captures=captures)
+    whole = FirstMatches(
+        episodes, runs=len(lists.start), confirm=confirm, count_earlier=count_earlier, captures=captures
+    )
     whole.add(lists, matches, issue_s)
     return whole.result()

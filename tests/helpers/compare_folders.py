@@ -14,7 +14,7 @@ import pyarrow as pa
 from pyarrow import parquet
 from scipy import stats
 
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 
 Row = dict[str, Any]
 
@@ -32,8 +32,8 @@ def limits_of(names: Sequence[str], figure: Callable[[list[str]], float], seed: 
         drawn = Counter(tuple(sorted(some)) for some in itertools.product(ranked, repeat=K))
     else:
         zeros = np.zeros(K, dtype=np.int64)
-        uniform = Dice(seed, "summary").uniform(
-            "bootstrap", Address(("",), zeros, object_words(ranked), zeros), np.arange(2000)
+        uniform = CounterRng(seed, "summary").uniform(
+            "bootstrap", RandomKey(("",), zeros, object_words(ranked), zeros), np.arange(2000)
         )
         drawn = Counter(tuple(ranked[int(u * K)] for u in resample) for resample in uniform)
     figures = [figure(list(some)) for some in drawn]

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from copem_replay.core.tracks import CLASSES, VALUES
 from copem_replay.io.encodings.cdr import CdrDefinition
 from copem_replay.io.encodings.columns import Texts
-from copem_replay.io.schemas.object_lists import Listed
+from copem_replay.io.schemas.object_lists import DecodedLists
 
 SEPARATOR = "=" * 80 + "\n"
 
@@ -46,16 +46,16 @@ def texts(column: Texts) -> list[str | None]:
     return [column.words[k] if k >= 0 else None for k in column.code]
 
 
-def values(found: Listed, name: str) -> list[Any]:
+def values(found: DecodedLists, name: str) -> list[Any]:
     column = found.columns.values[:, VALUES.index(name)]
     return [None if math.isnan(v) else pytest.approx(v) for v in column]
 
 
-def classes(found: Listed) -> list[str]:
+def classes(found: DecodedLists) -> list[str]:
     return [CLASSES[k] for k in found.columns.class_ix]
 
 
-def ids(found: Listed) -> list[str]:
+def ids(found: DecodedLists) -> list[str]:
     return [found.columns.object_ids[k] for k in found.columns.object_ix]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES
 
 Array = npt.NDArray[Any]
@@ -36,7 +36,7 @@ def joined(*lists: Entries) -> Entries:
     return np.concatenate([entries_of(0), *lists])
 
 
-def lists_of(lists_by_run: Sequence[Sequence[Entries]]) -> Lists:
+def lists_of(lists_by_run: Sequence[Sequence[Entries]]) -> ObjectLists:
     """Lists from [run][number]."""
     count = len(lists_by_run[0])
     assert all(len(lists) == count for lists in lists_by_run), "every run has the same lists"
@@ -44,36 +44,36 @@ def lists_of(lists_by_run: Sequence[Sequence[Entries]]) -> Lists:
     ends = np.cumsum(lengths).reshape(lengths.shape)
     first = np.concatenate([[0], ends[:-1, -1]]) if count else np.zeros(len(lists_by_run))
     start = np.concatenate([first[:, None], ends], axis=1).astype(np.int64)
-    return Lists(start, joined(*(one for lists in lists_by_run for one in lists)))
+    return ObjectLists(start, joined(*(one for lists in lists_by_run for one in lists)))
 
 
-def between(lists: Lists, first: int, after: int) -> tuple[Lists, Array]:
+def between(lists: ObjectLists, first: int, after: int) -> tuple[ObjectLists, Array]:
     """The lists `first` … `after` − 1 of every run, and which entries of all theirs are."""
     start = lists.start[:, first : after + 1]
     lengths = np.diff(start, axis=1)
     ends = np.cumsum(lengths.sum(axis=1))
     rows = np.concatenate([np.empty(0, dtype=np.int64), *(np.arange(one[0], one[-1]) for one in start)])
-    return Lists(start - start[:, :1] + (ends - lengths.sum(axis=1))[:, None], lists.entries[rows]), rows
+    return ObjectLists(start - start[:, :1] + (ends - lengths.sum(axis=1))[:, None], lists.entries[rows]), rows
 
 
-def stretches(cuts: Sequence[float], count: int) -> list[tuple[int, int]]:
+def chunks(cuts: Sequence[float], count: int) -> list[tuple[int, int]]:
     """From where to where `count` things go when they are cut at these shares of them."""
     places = [0, *sorted(round(cut * count) for cut in cuts), count]
     return list(pairwise(places))
 
 
-def reports_of(
+def inputs_of(
     lists_by_run: Sequence[Sequence[Entries]],
     units: Sequence[str],
     captured_s: Sequence[float],
     arrives_s: Sequence[float],
     max_age_s: float = 1.0,
     names: Sequence[str] | None = None,
-) -> Reports:
+) -> Inputs:
     """Reports of lists [run][f], list f being of the unit `units[f]`.
 
     `names`: all units in the order of the experiment, by default in the order of their first list. An arrival of inf is
-    none. Instants, newest lists and arrivals are found list by list, as the words of `Reports` say.
+    none. Instants, newest lists and arrivals are found list by list, as the words of `Inputs` say.
     """
     assert len(units) == len(captured_s) == len(arrives_s) == len(lists_by_run[0])
     order = tuple(names if names is not None else dict.fromkeys(units))
@@ -97,7 +97,7 @@ def reports_of(
             if mine:
                 f = max(mine, key=lambda f: captured_s[f])
                 newest[k, u] = f if issue_s[k] <= arrives_s[f] + max_age_s + SAME_S else -1
-    return Reports(
+    return Inputs(
         units=order,
         unit_ix=unit_ix,
         captured_s=np.array(captured_s, dtype=float),

@@ -220,8 +220,8 @@ def test_cut_off_in_the_only_chunk(path):
 @pytest.mark.parametrize("compression", list(CompressionType))
 def test_of_a_chunk_that_is_cut_off_what_is_there_is_read(path, compression):
     """Many recordings are one chunk. Of 2,000 messages that hardly compress, about 6 in 10 are in 6 tenths of it."""
-    dice = random.Random(2)
-    frames = [(k / 10, [Obj(id=i, x=dice.random(), y=dice.random()) for i in range(9)]) for k in range(2000)]
+    rng = random.Random(2)
+    frames = [(k / 10, [Obj(id=i, x=rng.random(), y=rng.random()) for i in range(9)]) for k in range(2000)]
     write_recording(path, frames, compression=compression, chunk_size=1 << 24)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) * 6 // 10])
@@ -307,10 +307,10 @@ def test_a_flipped_bit_anywhere_gives_a_recording_or_one_line(path, compression)
     frames = [(k / 10, [Obj(id=i, x=10.0 * k) for i in range(4)]) for k in range(12)]
     write_recording(path, frames, chunk_size=400, compression=compression, host=2)
     whole = path.read_bytes()
-    dice = random.Random(1)
+    rng = random.Random(1)
     for _ in range(500):
         data = bytearray(whole)
-        data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         path.write_bytes(data)
         found = outcome(path)
         if isinstance(found, Recording):

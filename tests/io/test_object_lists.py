@@ -11,7 +11,16 @@ from pydantic import ValidationError
 
 from copem_replay.core.tracks import CLASSES, VALUES
 from copem_replay.io.encodings.json import JsonDefinition
-from copem_replay.io.schemas.object_lists import Class, Description, Fields, FieldsError, Listed, Stamp, Yaw, listed
+from copem_replay.io.schemas.object_lists import (
+    Class,
+    DecodedLists,
+    Description,
+    Fields,
+    FieldsError,
+    Stamp,
+    Yaw,
+    listed,
+)
 from tests.helpers.messages import SEPARATOR, classes, defined, ids, quaternion, serialised, values
 from tests.io.test_columns import OBJECTS, in_protobuf
 
@@ -19,14 +28,14 @@ LEAST: dict[str, Any] = {"objects": "o[]", "x_m": "x", "y_m": "y", "length_m": 4
 OBJECT: dict[str, Any] = {"x": 1.0, "y": 2.0}
 
 
-def read(fields: dict[str, Any], *messages: Any, logged: list[int] | None = None, **more: Any) -> Listed:
+def read(fields: dict[str, Any], *messages: Any, logged: list[int] | None = None, **more: Any) -> DecodedLists:
     payloads = [m if isinstance(m, bytes) else json.dumps(m).encode() for m in messages]
     description = Description(Fields.model_validate({**LEAST, **fields}), **more)
     times = np.array(logged or [1000 + k for k in range(len(payloads))], dtype=np.int64)
     return listed(JsonDefinition(payloads), description, payloads, times)
 
 
-def one(fields: dict[str, Any], *objects: dict[str, Any], **more: Any) -> Listed:
+def one(fields: dict[str, Any], *objects: dict[str, Any], **more: Any) -> DecodedLists:
     """Of a single message with these objects."""
     return read(fields, {"o": [{**OBJECT, **o} for o in objects or ({},)]}, **more)
 

@@ -20,7 +20,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import Believed, believe
+from copem_replay.pipeline.receiver import ReceiverOutput, receive
 from copem_replay.pipeline.run import Result, run
 from tests.helpers.recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording
 
@@ -93,9 +93,9 @@ def replayed(path: Path, **changes: Any) -> Result:
     return run(plan_of(path, **changes), [read(path, **changes)])
 
 
-def told(path: Path, **changes: Any) -> dict[str, Believed]:
+def told(path: Path, **changes: Any) -> dict[str, ReceiverOutput]:
     plan = plan_of(path, **changes)
-    return dict(believe(prepare(read(path, **changes), plan).world(plan), np.arange(2), None))
+    return dict(receive(prepare(read(path, **changes), plan).world(plan), np.arange(2), None))
 
 
 def figure(result: Result, name: str, configuration: str = "union") -> float:
@@ -266,8 +266,8 @@ class TestWhoItIs:
 
     def test_nobody_but_the_ideal_learns_of_it(self, tmp_path: Path) -> None:
         """The truth has other numbers, another order, or nobody but the ego: the fused lists are the same."""
-        dice, cars = np.random.default_rng(0), [(30.0, 0.0), (33.0, 1.0), (38.0, -4.0)]
-        entries = [[car(x + dice.normal(), y + dice.normal(), track=int(x)) for x, y in cars] for _ in range(20)]
+        rng, cars = np.random.default_rng(0), [(30.0, 0.0), (33.0, 1.0), (38.0, -4.0)]
+        entries = [[car(x + rng.normal(), y + rng.normal(), track=int(x)) for x, y in cars] for _ in range(20)]
         found = []
         for number, ids in enumerate(([2, 3, 4], [9, 2, 4], [])):
             objects = [Obj(id=1), *(Obj(id=i, x=cars[i % 3][0], y=cars[i % 3][1]) for i in ids)]

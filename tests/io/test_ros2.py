@@ -18,7 +18,7 @@ from copem_replay.io.encodings.columns import Definition
 from copem_replay.io.encodings.json import JsonDefinition
 from copem_replay.io.encodings.protobuf import ProtobufDefinition
 from copem_replay.io.schemas.foxglove import description
-from copem_replay.io.schemas.object_lists import Listed, listed
+from copem_replay.io.schemas.object_lists import DecodedLists, listed
 from copem_replay.io.schemas.registry import SCHEMAS
 from tests.helpers.messages import SEPARATOR, classes, ids, quaternion, serialised, values
 
@@ -50,7 +50,7 @@ def text_of(first: str, **others: str) -> str:
     return ("\n" + SEPARATOR).join([first, *parts]) + "\n"
 
 
-def written(name: str, text: str, *messages: dict[str, Any], encoding: str = "ros2msg", idl: str = "") -> Listed:
+def written(name: str, text: str, *messages: dict[str, Any], encoding: str = "ros2msg", idl: str = "") -> DecodedLists:
     """Serialised by rosbags; the package of `text` is called p."""
     text = text.replace("MSG: p/", f"MSG: {name.split('/')[0]}/")
     definition = CdrDefinition(name, encoding, (idl or text).encode())

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from copem_replay.core.rotation import yaw_of
 from copem_replay.io.schemas.poses import Poses
-from copem_replay.io.transforms import Frames, Placed, course_of
+from copem_replay.io.transforms import Frames, PosesAt, pose_track_of
 
 Sample = tuple[float, float, float, float]
 """Seconds, x, y, yaw in degrees."""
@@ -34,7 +34,7 @@ def at(*seconds: float) -> np.ndarray:
     return np.array([round(s * 1e9) for s in seconds], dtype=np.int64)
 
 
-def flat(placed: Placed | None) -> list[list[float]]:
+def flat(placed: PosesAt | None) -> list[list[float]]:
     """x, y and yaw in degrees."""
     assert placed is not None
     found = np.column_stack([placed.position_m[:, :2], np.rad2deg(yaw_of(placed.rotation))])
@@ -94,11 +94,11 @@ def test_a_circle_has_an_end() -> None:
 
 
 def test_of_several_samples_at_an_instant_the_first() -> None:
-    course = course_of(poses("map", "base", (0.2, 3, 0, 0), (0.1, 1, 0, 0), (0.1, 2, 0, 0)))
+    course = pose_track_of(poses("map", "base", (0.2, 3, 0, 0), (0.1, 1, 0, 0), (0.1, 2, 0, 0)))
     assert course is not None
     assert course.stamp_ns.tolist() == [100_000_000, 200_000_000]
     assert course.position_m[:, 0].tolist() == [1.0, 3.0]
-    assert course_of(poses("map", "base", (0, 0, 0, 0)), np.array([False])) is None
+    assert pose_track_of(poses("map", "base", (0, 0, 0, 0)), np.array([False])) is None
 
 
 ANGLE = st.floats(-180, 180)

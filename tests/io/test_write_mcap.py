@@ -22,7 +22,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError, RecordingError
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
@@ -34,7 +34,7 @@ from copem_replay.io.write import osi_sensor_data as sensor_data
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
 from copem_replay.io.write.message_family import family_of
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
 
 ROOT = Path(__file__).parents[2]
@@ -59,14 +59,14 @@ class Written:
         self.experiment: Experiment = experiment
         (self.recording,) = read_logs(experiment, log_paths(source)[0], source)[0]
         self.replay: Replay = prepare(self.recording, experiment)
-        self.beliefs: dict[str, Belief] = believed(self.replay, experiment, RUN)
+        self.run_tracks: dict[str, FusedTracks] = tracks_of_run(self.replay, experiment, RUN)
         self.table: pd.DataFrame = replay_block(self.replay, experiment, np.array([RUN]))
         self.path = folder / "replay.mcap"
         self.notes = self.write(self.path)
 
     def write(self, path: Path, source: Path = SOURCE) -> list[str]:
         manifest = {"experiment": "version: 1", "run": str(RUN)}
-        return write_mcap(path, source, self.replay.scene, [self.beliefs], self.table, manifest)
+        return write_mcap(path, source, self.replay.scene, [self.run_tracks], self.table, manifest)
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +121,8 @@ def test_channels_and_records(written: Written) -> None:
 
 @pytest.mark.parametrize("configuration", ["GT", "PEM", "coPEM:0.5s", "mixed"])
 def test_sensor_data_says_what_was_believed(written: Written, configuration: str) -> None:
-    belief, scene = written.beliefs[configuration], written.replay.scene
-    fused = belief.fused
+    fused_tracks, scene = written.run_tracks[configuration], written.replay.scene
+    fused = fused_tracks.fused
     lists = [m for m in messages(written.path) if m[0] == f"copem/{configuration}/objects"]
     assert len(lists) == len(fused.stamp_ns)
 
@@ -165,12 +165,12 @@ def test_sensor_data_says_what_was_believed(written: Written, configuration: str
                 assert (base.velocity.x, base.velocity.y) == (fused.vx_mps[0, p], fused.vy_mps[0, p])
                 assert (spread.velocity.x, spread.velocity.y) == (sigma("speed_var_m2ps2", p),) * 2
             assert item.header.existence_probability == 1
-            entries = belief.entries[belief.start[p] : belief.start[p + 1]]
-            behind = [k for k in entries if belief.heard.valid[0, k]]
+            entries = fused_tracks.entries[fused_tracks.start[p] : fused_tracks.start[p + 1]]
+            behind = [k for k in entries if fused_tracks.heard.valid[0, k]]
             assert [units[i.value] for i in item.header.sensor_id] == [
-                belief.heard.units[belief.heard.row_unit_ix[k]] for k in behind
+                fused_tracks.heard.units[fused_tracks.heard.row_unit_ix[k]] for k in behind
             ]
-            newest = max(belief.heard.stamp_ns[belief.heard.frame_ix[k]] for k in behind)
+            newest = max(fused_tracks.heard.stamp_ns[fused_tracks.heard.frame_ix[k]] for k in behind)
             assert (item.header.measurement_state == 2) == (newest == captured), "measured, or only from an older list"
     assert seen > 100
 
@@ -183,8 +183,8 @@ def test_ids_beyond_64_bits_are_hashed() -> None:
 
 
 def test_scene_updates_draw_each_list_anew(written: Written) -> None:
-    fused, scene = written.beliefs["PEM"].fused, written.replay.scene
-    colour = configuration_colours(written.beliefs)["PEM"]
+    fused, scene = written.run_tracks["PEM"].fused, written.replay.scene
+    colour = configuration_colours(written.run_tracks)["PEM"]
     assert max(colour) > 100
     updates = [m for m in messages(written.path) if m[0] == "copem/PEM/scene"]
     assert len(updates) == len(fused.stamp_ns)
@@ -223,9 +223,9 @@ def test_details_tell_entries_and_detections(written: Written) -> None:
 
 def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
     """Object by object in the order of the list: what it was made of, and its variances."""
-    belief, scene = written.beliefs["mixed"], written.replay.scene
-    fused, heard, look = belief.fused, belief.heard, belief.look
-    assert look is not None
+    fused_tracks, scene = written.run_tracks["mixed"], written.replay.scene
+    fused, heard, episode = fused_tracks.fused, fused_tracks.heard, fused_tracks.view
+    assert episode is not None
     contents = [json.loads(m[4]) for m in messages(written.path) if m[0] == "copem/mixed/detail"]
     assert len(contents) == len(fused.stamp_ns)
     several = 0
@@ -238,21 +238,23 @@ def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
         )
         for one in content["objects"]:
             (p,) = [p for p in rows if scene.object_ids[fused.row_object_ix[p]] == one["id"]]
-            used = [k for k in belief.entries[belief.start[p] : belief.start[p + 1]] if heard.valid[0, k]]
+            used = [
+                k for k in fused_tracks.entries[fused_tracks.start[p] : fused_tracks.start[p + 1]] if heard.valid[0, k]
+            ]
             several += len(used) > 1
             assert one["units"] == [heard.units[heard.row_unit_ix[k]] for k in used]
             assert one["captured_ns"] == [heard.stamp_ns[heard.frame_ix[k]] for k in used]
-            assert one["range_m"] == [look.range_m[k] for k in used]
-            assert one["visible_share"] == [look.visible_share[k] for k in used]
+            assert one["range_m"] == [episode.range_m[k] for k in used]
+            assert one["visible_share"] == [episode.visible_share[k] for k in used]
             assert [one[name] for name in UNCERTAINTIES] == [getattr(fused, name)[0, p] for name in UNCERTAINTIES]
     assert several > 100
 
 
 def test_a_list_of_nothing_was_captured_never(written: Written) -> None:
-    belief = written.beliefs["PEM"]
-    never = np.full(len(belief.fused.stamp_ns), NO_CAPTURE_NS)
-    silent = replace(belief.fused, stamp_ns=never, valid=np.zeros_like(belief.fused.valid))
-    writer = detail.DetailWriter(written.replay.scene, replace(belief, fused=silent), {})
+    fused_tracks = written.run_tracks["PEM"]
+    never = np.full(len(fused_tracks.fused.stamp_ns), NO_CAPTURE_NS)
+    silent = replace(fused_tracks.fused, stamp_ns=never, valid=np.zeros_like(fused_tracks.fused.valid))
+    writer = detail.DetailWriter(written.replay.scene, replace(fused_tracks, fused=silent), {})
     assert json.loads(writer.message(0, 7)) == {"available_ns": 7, "captured_ns": None, "objects": [], "events": []}
 
 
@@ -274,7 +276,7 @@ def rows_by_key(tracks: Any) -> dict[tuple[int, int], int]:
 
 @pytest.mark.parametrize("configuration", ["GT", "PEM", "coPEM:0.5s", "mixed"])
 def test_read_back_as_lists_every_column_is_there(written: Written, configuration: str) -> None:
-    fused = written.beliefs[configuration].fused
+    fused = written.run_tracks[configuration].fused
     back = read_lists(written.path, f"copem/{configuration}/objects", written.replay.scene)
     np.testing.assert_array_equal(back.stamp_ns, fused.stamp_ns)
     np.testing.assert_allclose(back.arrives_s, fused.arrives_s, atol=1e-9)
@@ -330,7 +332,7 @@ def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path)
     family = family_of(written.recording)
     manifest = {"experiment": "version: 1", "run": str(RUN)}
     path = tmp_path / "out.mcap"
-    write_mcap(path, SOURCE, written.replay.scene, [written.beliefs], written.table, manifest, family)
+    write_mcap(path, SOURCE, written.replay.scene, [written.run_tracks], written.table, manifest, family)
     assert path.read_bytes() == written.path.read_bytes()
     with path.open("rb") as file:
         reader = make_reader(file)
@@ -347,13 +349,13 @@ def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path)
     others = len(summary.channels) - len(ours)
     assert [(c.id, c.topic, c.message_encoding, summary.schemas[c.schema_id].name, bool(c.metadata)) for c in ours] == [
         (others + 1 + 3 * k + i, f"copem/{name}/{kind}", *rest)
-        for k, name in enumerate(written.beliefs)
+        for k, name in enumerate(written.run_tracks)
         for i, (kind, *rest) in enumerate(kinds)
     ]
     scene = written.replay.scene
-    for name, belief in written.beliefs.items():
+    for name, fused_tracks in written.run_tracks.items():
         numbers = {v: int(k[5:]) for k, v in metadata(path)[RUN_RECORD].items() if k.startswith("unit.")}
-        plain = sensor_data.SensorDataWriter(scene, belief, numbers)
+        plain = sensor_data.SensorDataWriter(scene, fused_tracks, numbers)
         lists = [(m[1], m[4]) for m in messages(path) if m[0] == f"copem/{name}/objects"]
         assert lists == [(at, plain.message(frame, at)) for frame, (at, _) in enumerate(lists)]
 

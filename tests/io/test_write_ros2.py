@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
@@ -26,7 +26,7 @@ from copem_replay.io.write.autoware_objects import LABELS
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, write_mcap
 from copem_replay.io.write.message_family import family_of
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from copem_replay.results.write import write_results
@@ -185,7 +185,7 @@ class Written:
         self.experiment: Experiment = experiment
         (self.recording,) = read_logs(experiment, log_paths(source)[0], source)[0]
         self.replay: Replay = prepare(self.recording, experiment)
-        self.beliefs: dict[str, Belief] = believed(self.replay, experiment, 0)
+        self.run_tracks: dict[str, FusedTracks] = tracks_of_run(self.replay, experiment, 0)
         self.table: pd.DataFrame = replay_block(self.replay, experiment, np.array([0]))
         self.path = folder / "replay.mcap"
         self.notes = self.write(self.path)
@@ -195,7 +195,7 @@ class Written:
             path,
             source or self.source,
             self.replay.scene,
-            [self.beliefs],
+            [self.run_tracks],
             self.table,
             {"run": "0"},
             family_of(self.recording),
@@ -255,8 +255,8 @@ def test_the_profile_stays_valid_and_the_input_untouched(written: Written) -> No
 
 @pytest.mark.parametrize("configuration", ["GT", "PEM", "coPEM", "gnn"])
 def test_every_column_comes_back(written: Written, configuration: str) -> None:
-    belief, scene = written.beliefs[configuration], written.replay.scene
-    fused, said, kinds = belief.fused, belief.said, belief.class_of(scene)
+    fused_tracks, scene = written.run_tracks[configuration], written.replay.scene
+    fused, said, kinds = fused_tracks.fused, fused_tracks.said, fused_tracks.class_of(scene)
     lists = list(decoded(written.path, f"copem/{configuration}/objects"))
     details = [json.loads(m.data) for _, _, m in decoded(written.path, f"copem/{configuration}/detail")]
     assert len(lists) == len(details) == len(fused.stamp_ns)
@@ -264,11 +264,11 @@ def test_every_column_comes_back(written: Written, configuration: str) -> None:
     for frame, ((log_ns, _, message), detail) in enumerate(zip(lists, details, strict=True)):
         assert stamp_of(message.header.stamp) == log_ns == scene.t0_ns + round(fused.arrives_s[0, frame] * 1e9)
         assert message.header.frame_id == "map"
-        rows = belief.listed(frame)
+        rows = fused_tracks.listed(frame)
         assert len(message.objects) == len(detail["objects"]) == len(rows)
         for item, beside, p in zip(message.objects, detail["objects"], rows, strict=True):
             seen += 1
-            assert beside["id"] == belief.name_of(scene, p)
+            assert beside["id"] == fused_tracks.name_of(scene, p)
             pose, twist = item.kinematics.pose_with_covariance, item.kinematics.twist_with_covariance
             at, turn, size = pose.pose.position, pose.pose.orientation, item.shape.dimensions
             assert (at.x, at.y, at.z) == (fused.x_m[0, p], fused.y_m[0, p], fused.z_m[0, p])
@@ -311,21 +311,21 @@ def test_every_column_comes_back(written: Written, configuration: str) -> None:
 
 
 def test_scene_updates_draw_each_list_anew(written: Written) -> None:
-    belief, scene = written.beliefs["gnn"], written.replay.scene
+    fused_tracks, scene = written.run_tracks["gnn"], written.replay.scene
     updates = list(decoded(written.path, "copem/gnn/scene"))
-    assert len(updates) == len(belief.fused.stamp_ns)
+    assert len(updates) == len(fused_tracks.fused.stamp_ns)
     for frame, (log_ns, _, update) in enumerate(updates):
         assert [(d.type, stamp_of(d.timestamp), d.id) for d in update.deletions] == [(1, log_ns, "")]
-        rows = belief.listed(frame)
-        assert [e.id for e in update.entities] == [belief.name_of(scene, p) for p in rows]
+        rows = fused_tracks.listed(frame)
+        assert [e.id for e in update.entities] == [fused_tracks.name_of(scene, p) for p in rows]
         for entity, p in zip(update.entities, rows, strict=True):
             assert (entity.frame_id, stamp_of(entity.timestamp), stamp_of(entity.lifetime)) == ("map", log_ns, 0)
             assert {m.key: m.value for m in entity.metadata} == {
-                "configuration": "gnn", "class": CLASSES[belief.class_of(scene)[p]], "object": entity.id,
+                "configuration": "gnn", "class": CLASSES[fused_tracks.class_of(scene)[p]], "object": entity.id,
             }  # fmt: skip
             (cube,) = entity.cubes
             at, size, color = cube.pose.position, cube.size, cube.color
-            fused = belief.fused
+            fused = fused_tracks.fused
             assert [at.x, at.y, at.z, size.x, size.y, size.z] == [
                 getattr(fused, n)[0, p] for n in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")
             ]
@@ -337,11 +337,11 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
 
 @pytest.mark.parametrize("configuration", ["GT", "coPEM", "gnn"])
 def test_read_back_as_the_lists_of_a_unit(written: Written, configuration: str) -> None:
-    belief, scene = written.beliefs[configuration], written.replay.scene
-    fused = belief.fused
+    fused_tracks, scene = written.run_tracks[configuration], written.replay.scene
+    fused = fused_tracks.fused
     back = read_listed(written.path, f"copem/{configuration}/objects", scene, None)
     assert back is not None
-    rows = [p for frame in range(len(fused.stamp_ns)) for p in belief.listed(frame)]
+    rows = [p for frame in range(len(fused.stamp_ns)) for p in fused_tracks.listed(frame)]
     assert len(back.tracks.frame_ix) == len(rows) > 0
     np.testing.assert_allclose(back.tracks.arrives_s, fused.arrives_s, atol=1e-9)
     np.testing.assert_array_equal(back.tracks.frame_ix, fused.frame_ix[rows])
@@ -358,9 +358,9 @@ def test_read_back_as_the_lists_of_a_unit(written: Written, configuration: str) 
     )
     np.testing.assert_array_equal(back.tracks.stamp_ns[captured], fused.stamp_ns[captured])
     np.testing.assert_array_equal(back.capture_said, captured)
-    if belief.said is not None:
-        np.testing.assert_array_equal(back.existence, belief.said["existence"][rows])
-    assert back.class_probability.argmax(axis=1).tolist() == belief.class_of(scene)[rows].tolist()
+    if fused_tracks.said is not None:
+        np.testing.assert_array_equal(back.existence, fused_tracks.said["existence"][rows])
+    assert back.class_probability.argmax(axis=1).tolist() == fused_tracks.class_of(scene)[rows].tolist()
 
 
 def test_read_back_as_a_log_it_is_the_input(written: Written) -> None:
@@ -385,10 +385,10 @@ def test_names_of_any_length_do_not_shift_what_follows(written: Written, tmp_pat
     (tmp_path / "e.yaml").write_text(EXPERIMENT)
     recording = read(source, name="drive", ego=written.experiment.ego)
     target = tmp_path / "out.mcap"
-    write_mcap(target, source, written.replay.scene, [written.beliefs], written.table, {}, family_of(recording))
+    write_mcap(target, source, written.replay.scene, [written.run_tracks], written.table, {}, family_of(recording))
     lists = [m for _, _, m in decoded(target) if hasattr(m, "header")]
     assert {m.header.frame_id for m in lists} == {frame_id.lstrip("/") or "map"}
-    assert sum(len(m.objects) for m in lists) == sum(int(b.fused.valid.sum()) for b in written.beliefs.values())
+    assert sum(len(m.objects) for m in lists) == sum(int(b.fused.valid.sum()) for b in written.run_tracks.values())
 
 
 def folder_of(path: Path) -> tuple[Recording, Path]:

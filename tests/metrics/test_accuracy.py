@@ -12,22 +12,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.core.object_list import Entries, Lists
+from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import CLASSES
 from copem_replay.metrics.accuracy import metrics as accuracy_figures
-from copem_replay.metrics.accuracy.aggregator import Assessment
+from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.accuracy.nees import expected
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, total
 from copem_replay.metrics.gospa import gospa, ospa
 from copem_replay.metrics.matching import Matches, match, match_both
 from tests.helpers.at_once import assess
-from tests.helpers.reports import between, entry, lists_of, stretches
+from tests.helpers.reports import between, chunks, entry, lists_of
 from tests.helpers.reports import joined as one_list
 from tests.oracles.accuracy import (
     Places,
+    episodes_of,
     expected_of,
-    looks_of,
     matches_of,
     one_run,
     permuted,
@@ -48,7 +48,7 @@ def classes(*names: str) -> Any:
 
 
 def assessed(
-    *runs: Sequence[Entries], places: Places, looks: dict[int, tuple[float, float]],
+    *runs: Sequence[Entries], places: Places, episodes: dict[int, tuple[float, float]],
     times_s: Sequence[float] | None = None, of: Sequence[str] = ("car", "car", "car", "car"), since_s: float = 0.0,
     velocity: dict[int, tuple[float, float]] | None = None, captures: tuple[Sequence[float], Places] | None = None,
     ego: Sequence[tuple[float, float] | None] | None = None, measured: Sequence[str] = ("car",), **given: Any,
@@ -63,7 +63,7 @@ def assessed(
     if captures is not None:
         about, now = match_both(lists, truth_of(captures[1], captures[0]), world, scene, gate_m=GATE_M)
     return assess(
-        lists, about, now, times, world, scene, looks_of(looks), np.full(len(looks), since_s),
+        lists, about, now, times, world, scene, episodes_of(episodes), np.full(len(episodes), since_s),
         reference_of(at_ego), classes(*measured), settings=Settings(**({"cutoff_m": 3.0, "gate_m": GATE_M} | given)),
     )  # fmt: skip
 
@@ -81,7 +81,7 @@ def standing(x_m: float, y_m: float, count: int) -> list[tuple[float, float]]:
 
 def test_position_error_and_bias_of_pairs() -> None:
     lists = [entry(11, 0), NOTHING, entry(10, 2)]
-    of = assessed(lists, places={CAR: standing(10, 0, 3)}, looks={CAR: (0, 2)})
+    of = assessed(lists, places={CAR: standing(10, 0, 3)}, episodes={CAR: (0, 2)})
     assert of.error_m.tolist() == [[1.0, pytest.approx(math.nan, nan_ok=True), 2.0]]
     assert figure("position_rmse_m", of) == pytest.approx(math.sqrt(5 / 2))
     assert figure("bias_east_m", of) == pytest.approx(0.5)
@@ -96,8 +96,8 @@ def test_latency_is_an_error_now_and_none_at_capture() -> None:
     lists = [entry(2 * (t - 0.5), 20, captured_s=t - 0.5, vx_mps=2.0) for t in times]
     captures = [0.5, 1.5, 2.5]
     of = assessed(
-        lists, times_s=times, places={CAR: [(2 * t, 20) for t in times]}, velocity={CAR: (2, 0)}, looks={CAR: (0, 3)},
-        captures=(captures, {CAR: [(2 * t, 20) for t in captures]}),
+        lists, times_s=times, places={CAR: [(2 * t, 20) for t in times]}, velocity={CAR: (2, 0)},
+        episodes={CAR: (0, 3)}, captures=(captures, {CAR: [(2 * t, 20) for t in captures]}),
     )  # fmt: skip
     assert figure("position_rmse_m", of) == pytest.approx(1.0)
     assert figure("bias_east_m", of) == pytest.approx(-1.0)
@@ -109,13 +109,13 @@ def test_latency_is_an_error_now_and_none_at_capture() -> None:
 def test_what_tells_of_an_instant_without_truth_is_about_nobody() -> None:
     lists = [entry(10.5, captured_s=t) for t in (0.0, 0.5, 2.0 + 9e-7, 2.5)]
     captures = ([0.0, 0.5, 2.0, 2.5], {CAR: [(10.0, 0.0), None, (11.5, 0.0), None]})
-    of = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)}, captures=captures)
+    of = assessed(lists, places={CAR: standing(10, 0, 4)}, episodes={CAR: (0, 3)}, captures=captures)
     assert of.by_object[0, 0]["pairs"] == 2
     assert figure("position_rmse_captured_m", of) == pytest.approx(math.sqrt((0.5**2 + 1.0**2) / 2))
     # Now the car is there: its entries are no ghosts, and none of it is missed.
     assert (of.by_run[0]["ghosts"], of.by_object[0, 0]["missed"]) == (0, 0)
     assert of.by_existence["with_object"].sum() == 2
-    gone = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)}, captures=([0.0], {}))
+    gone = assessed(lists, places={CAR: standing(10, 0, 4)}, episodes={CAR: (0, 3)}, captures=([0.0], {}))
     assert figure("position_rmse_captured_m", gone) is None
 
 
@@ -130,7 +130,7 @@ def late_by(latency_s: float, speed_mps: float = 12.0, count: int = 5) -> Accura
     ]
     return assessed(
         lists, times_s=times.tolist(), places={CAR: ways["now"]}, velocity={CAR: (speed_mps, 0)},
-        looks={CAR: (0, count)}, captures=(captures.tolist(), {CAR: ways["then"]}),
+        episodes={CAR: (0, count)}, captures=(captures.tolist(), {CAR: ways["then"]}),
     )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def test_ghosts_that_are_about_nobody_then_either_are_not_stale_and_only_these_h
     lists = [one_list(entry(10, captured_s=0.0, existence=0.9), entry(50, captured_s=0.0, existence=0.6))] * 2
     captures = ([0.0], {CAR: [(10.0, 0.0)]})
     of = assessed(
-        lists, times_s=[1, 2], places={CAR: standing(20, 0, 2)}, looks={CAR: (1, 2)}, captures=captures,
+        lists, times_s=[1, 2], places={CAR: standing(20, 0, 2)}, episodes={CAR: (1, 2)}, captures=captures,
         existence_thresholds=(0.0, 0.7),
     )  # fmt: skip
     assert (of.by_run[0]["ghosts"], of.by_run[0]["stale_ghosts"]) == (4, 2)
@@ -178,7 +178,7 @@ def test_a_pair_whose_object_has_a_gap_now_has_no_error_now() -> None:
     lists = [entry(10.5, captured_s=0.0, track_id=3)] * 3
     captures = ([0.0], {CAR: [(10.0, 0.0)]})
     of = assessed(
-        lists, places={CAR: [(10, 0), None, (12, 0)]}, looks={CAR: (0, 2)}, captures=captures,
+        lists, places={CAR: [(10, 0), None, (12, 0)]}, episodes={CAR: (0, 2)}, captures=captures,
         distance_edges_m=(0.0, 60.0), time_edges_s=(1.0, 2.0),
     )  # fmt: skip
     sums = of.by_object[0, 0]
@@ -209,7 +209,7 @@ def test_what_the_gate_cuts_off(large: float, small: float, beyond: float, expec
     # Turned by 30°.
     c, s = math.cos(math.pi / 6), math.sin(math.pi / 6)
     cov = (large * c * c + small * s * s, (large - small) * c * s, large * s * s + small * c * c)
-    of = assessed([entry(10, cov=cov)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
+    of = assessed([entry(10, cov=cov)] * 2, places={CAR: standing(10, 0, 2)}, episodes={CAR: (0, 1)})
     assert figure("beyond_gate_share", of) == pytest.approx(beyond, abs=5e-5)
     assert figure("nees_expected", of) == pytest.approx(expected, abs=5e-5)
 
@@ -218,7 +218,7 @@ def test_the_gate_cuts_the_mean_and_the_spread_of_true_covariances() -> None:
     """Errors drawn with the covariance claimed: RMSE 1.92 instead of 2.83 m at v = 4, and NEES where its band says."""
     rng, variance, count = np.random.default_rng(5), 4.0, 4000
     runs = [[entry(10 + x, y, cov=(variance, 0, variance))] for x, y in rng.normal(0, math.sqrt(variance), (count, 2))]
-    of = assessed(*runs, places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    of = assessed(*runs, places={CAR: [(10, 0)]}, episodes={CAR: (0, 0)})
     assert figure("position_rmse_m", of) == pytest.approx(1.92, abs=0.02)
     nees = of.by_object["nees"][of.by_object["pairs"] > 0]
     assert len(nees) / count == pytest.approx(1 - 0.3247, abs=0.02)
@@ -242,13 +242,13 @@ def test_what_is_expected_within_the_gate_as_integrals_have_it(large: float, les
 
 def test_velocity_error_is_the_length_of_the_difference() -> None:
     lists = [entry(10, vx_mps=8.0, vy_mps=4.0), entry(10, vx_mps=5.0, vy_mps=0.0)]
-    of = assessed(lists, places={CAR: standing(10, 0, 2)}, velocity={CAR: (5, 0)}, looks={CAR: (0, 1)})
+    of = assessed(lists, places={CAR: standing(10, 0, 2)}, velocity={CAR: (5, 0)}, episodes={CAR: (0, 1)})
     assert figure("velocity_rmse_mps", of) == pytest.approx(math.sqrt(25 / 2))
 
 
 def test_pairs_count_before_the_onset_but_nothing_is_looked_at_then() -> None:
     lists = [entry(11), entry(11), entry(11), NOTHING]
-    of = assessed(lists, places={CAR: standing(10, 0, 4)}, looks={CAR: (2, 3)}, since_s=1.0)
+    of = assessed(lists, places={CAR: standing(10, 0, 4)}, episodes={CAR: (2, 3)}, since_s=1.0)
     sums = of.by_object[0, 0]
     assert (of.first_list.tolist(), of.count.tolist()) == ([1], [3])
     assert (sums["pairs"], sums["looked"], sums["missed"]) == (2, 2, 1)
@@ -259,7 +259,7 @@ def test_pairs_count_before_the_onset_but_nothing_is_looked_at_then() -> None:
 def test_nothing_counts_while_there_is_no_ego_nor_while_the_object_is_missing_nor_after_the_end() -> None:
     lists = [entry(11)] * 5
     ego = [(0.0, 0.0), None, (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)]
-    of = assessed(lists, places={CAR: [(10, 0), (10, 0), None, (10, 0), (10, 0)]}, looks={CAR: (0, 3)}, ego=ego)
+    of = assessed(lists, places={CAR: [(10, 0), (10, 0), None, (10, 0), (10, 0)]}, episodes={CAR: (0, 3)}, ego=ego)
     np.testing.assert_array_equal(of.error_m, [[1, np.nan, np.nan, 1]])
     assert of.by_object[0, 0]["looked"] == 2
     assert of.by_run[0]["lists"] == 4
@@ -277,14 +277,14 @@ def test_nothing_counts_while_there_is_no_ego_nor_while_the_object_is_missing_no
     ],
 )
 def test_nees(cov: tuple[float, float, float], error: tuple[float, float], expected: float) -> None:
-    of = assessed([entry(10 + error[0], error[1], cov=cov)], places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    of = assessed([entry(10 + error[0], error[1], cov=cov)], places={CAR: [(10, 0)]}, episodes={CAR: (0, 0)})
     assert figure("nees", of) == pytest.approx(expected, rel=1e-6)
 
 
 def test_nees_band_is_of_as_many_samples_as_rows_with_a_match() -> None:
     def of_rows(n: int) -> Accuracy:
         matched, missed = [entry(10), entry(10)], [NOTHING, NOTHING]
-        return assessed(*[matched] * n, missed, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)}, gate_m=100.0)
+        return assessed(*[matched] * n, missed, places={CAR: standing(10, 0, 2)}, episodes={CAR: (0, 1)}, gate_m=100.0)
 
     hundred, more = of_rows(100), of_rows(500)
     band = [figure("nees_low", hundred), figure("nees_high", hundred)]
@@ -296,17 +296,17 @@ def test_identity_switches_are_changes_of_the_track_last_named() -> None:
     tracks = [5, 5, -1, 7, 7, 5]
     lists = [entry(10, track_id=track) for track in tracks]
     none = [entry(10)] * 6
-    of = assessed(lists, none, [NOTHING] * 6, places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})
+    of = assessed(lists, none, [NOTHING] * 6, places={CAR: standing(10, 0, 6)}, episodes={CAR: (0, 5)})
     assert of.by_object["switches"].tolist() == [[2], [0], [0]]
     assert of.by_object["tracked"].tolist() == [[5], [0], [0]]
     assert figure("identity_switches", of) == pytest.approx(2.0)  # of the one run that names tracks
-    assert figure("identity_switches", assessed(none, places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})) is None
+    assert figure("identity_switches", assessed(none, places={CAR: standing(10, 0, 6)}, episodes={CAR: (0, 5)})) is None
 
 
 def test_duplicates_of_measured_objects() -> None:
     both = one_list(entry(10, existence=0.9), entry(10.1, existence=0.8), entry(40), entry(40.1))
     places = {CAR: standing(10, 0, 4), OTHER_CAR: standing(40, 0, 4)}  # the other one is not measured
-    of = assessed([both] * 4, places=places, looks={CAR: (2, 3)})
+    of = assessed([both] * 4, places=places, episodes={CAR: (2, 3)})
     assert of.by_object[0, 0]["duplicates"] == 2  # in the lists looked at
     assert of.by_run[0]["duplicates"] == 4  # in all
     assert figure("duplicates_per_min", of) == pytest.approx(60.0)
@@ -314,7 +314,7 @@ def test_duplicates_of_measured_objects() -> None:
 
 
 @pytest.mark.parametrize(
-    ("held", "look", "longest_s"),
+    ("held", "episode", "longest_s"),
     [
         ("11111", (0, 4), 0.0),
         ("00000", (0, 4), 4.0),
@@ -329,24 +329,24 @@ def test_duplicates_of_measured_objects() -> None:
         ("1.001", (0, 4), 2.0),
     ],
 )
-def test_longest_time_unknown(held: str, look: tuple[float, float], longest_s: float) -> None:
+def test_longest_time_unknown(held: str, episode: tuple[float, float], longest_s: float) -> None:
     lists = [entry(10) if h == "1" else NOTHING for h in held]
     ego = [None if h == "." else (0.0, 0.0) for h in held]
-    of = assessed(lists, places={CAR: standing(10, 0, 5)}, looks={CAR: look}, ego=ego)
+    of = assessed(lists, places={CAR: standing(10, 0, 5)}, episodes={CAR: episode}, ego=ego)
     assert of.by_object[0, 0]["longest_gap_s"] == pytest.approx(longest_s)
     assert figure("longest_gap_s", of) == pytest.approx(longest_s)
 
 
 def test_before_the_first_list_it_is_unknown() -> None:
-    of = assessed([entry(10)] * 2, times_s=[2.0, 3.0], places={CAR: standing(10, 0, 2)}, looks={CAR: (0.5, 3)})
+    of = assessed([entry(10)] * 2, times_s=[2.0, 3.0], places={CAR: standing(10, 0, 2)}, episodes={CAR: (0.5, 3)})
     assert of.by_object[0, 0]["longest_gap_s"] == pytest.approx(1.5)
     # Nor is a list from before its stay one of them.
-    of = assessed([entry(10), NOTHING], places={CAR: standing(10, 0, 2)}, looks={CAR: (1, 1.5)}, since_s=1.0)
+    of = assessed([entry(10), NOTHING], places={CAR: standing(10, 0, 2)}, episodes={CAR: (1, 1.5)}, since_s=1.0)
     assert of.by_object[0, 0]["longest_gap_s"] == pytest.approx(0.5)
 
 
 def test_never_matched() -> None:
-    of = assessed([NOTHING] * 3, places={CAR: standing(10, 0, 3)}, looks={CAR: (0, 2)})
+    of = assessed([NOTHING] * 3, places={CAR: standing(10, 0, 3)}, episodes={CAR: (0, 2)})
     for name in ("position_rmse_m", "position_rmse_captured_m", "bias_east_m", "velocity_rmse_mps",
                  "age_of_information_s", "nees",
                  "nees_low", "nees_high", "identity_switches", "existence_ece"):  # fmt: skip
@@ -363,7 +363,7 @@ def test_ghosts_are_of_measured_classes_and_of_no_object_at_all() -> None:
     )
     places = {CAR: standing(10, 0, 3), OTHER_CAR: standing(20, 0, 3), 3: standing(30, 0, 3)}
     of = assessed(
-        [entries, NOTHING, entries], places=places, looks={CAR: (0, 2), OTHER_CAR: (1, 2)},
+        [entries, NOTHING, entries], places=places, episodes={CAR: (0, 2), OTHER_CAR: (1, 2)},
         existence_thresholds=(0.0, 0.4, 0.5, 1.0),
     )  # fmt: skip
     # At the ego and at a neighbour nobody measures: no ghosts. The one at 60 m and the one beside the car are.
@@ -375,13 +375,13 @@ def test_ghosts_are_of_measured_classes_and_of_no_object_at_all() -> None:
 
 def test_a_ghost_halfway_goes_to_the_first() -> None:
     places = {OTHER_CAR: [(30.0, 0.0)], CAR: [(20.0, 0.0)]}
-    of = assessed([entry(25)], places=places, looks={CAR: (0, 0), OTHER_CAR: (0, 0)})
+    of = assessed([entry(25)], places=places, episodes={CAR: (0, 0), OTHER_CAR: (0, 0)})
     assert of.by_object["ghosts"].tolist() == [[1, 0]]
     assert of.gospa.tolist() == [[9.0, 4.5]]
 
 
 def test_where_nothing_is_looked_at_there_is_neither_gospa_nor_ospa_and_ghosts_are_nobodys() -> None:
-    of = assessed([entry(50)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (1, 1)})
+    of = assessed([entry(50)] * 2, places={CAR: standing(10, 0, 2)}, episodes={CAR: (1, 1)})
     assert (of.by_run[0]["lists"], of.by_run[0]["lists_looked"]) == (2, 1)
     assert of.by_run[0]["ghosts"] == 2
     assert of.by_object["ghosts"].tolist() == [[1]]
@@ -392,7 +392,7 @@ def test_where_nothing_is_looked_at_there_is_neither_gospa_nor_ospa_and_ghosts_a
     assert figure("gospa_m", of) == pytest.approx(3.0)
     assert figure("ospa_m", of) == pytest.approx(3.0)
     # An object that is missing from the truth is not looked at then.
-    gone = assessed([entry(50)] * 3, places={CAR: [(10, 0), None, (10, 0)]}, looks={CAR: (0, 2)})
+    gone = assessed([entry(50)] * 3, places={CAR: [(10, 0), None, (10, 0)]}, episodes={CAR: (0, 2)})
     assert gone.by_run[0]["lists_looked"] == 2
     assert figure("gospa_m", gone) == pytest.approx(3.0)
 
@@ -401,14 +401,14 @@ def test_gospa_and_ospa_of_the_worked_example() -> None:
     # Truth at 0, 10 and 20 m, believed 1 m beside, 0.5 m ahead, and at 40 m.
     shown = one_list(entry(0, 1), entry(10.5), entry(40))
     places = {1: [(0, 0)], 2: [(10, 0)], 3: [(20, 0)]}
-    of = assessed([shown], places=places, looks=dict.fromkeys(places, (0, 0)), ego=[(-50, 0)], cutoff_m=5.0)
+    of = assessed([shown], places=places, episodes=dict.fromkeys(places, (0, 0)), ego=[(-50, 0)], cutoff_m=5.0)
     assert figure("gospa_m", of) == pytest.approx(5.123475, abs=1e-6)
     assert figure("ospa_m", of) == pytest.approx(2.958040, abs=1e-6)
     assert figure("gospa_localisation_m", of) == pytest.approx(math.sqrt(1.25))
     assert figure("gospa_missed_m", of) == figure("gospa_false_m", of) == pytest.approx(math.sqrt(12.5))
     assert of.gospa.tolist() == [[1.0, 0.25, 25.0]]
     first_power = assessed(
-        [shown], places=places, looks=dict.fromkeys(places, (0, 0)), ego=[(-50, 0)], cutoff_m=5.0, power=1.0
+        [shown], places=places, episodes=dict.fromkeys(places, (0, 0)), ego=[(-50, 0)], cutoff_m=5.0, power=1.0
     )
     assert first_power.gospa.tolist() == [[1.0, 0.5, 5.0]]
     assert figure("gospa_m", first_power) == pytest.approx(6.5)
@@ -417,7 +417,7 @@ def test_gospa_and_ospa_of_the_worked_example() -> None:
 
 def test_gospa_takes_the_best_pairs_though_the_match_is_another() -> None:
     lists = [one_list(entry(10, existence=0.5), entry(11, existence=0.9))]
-    of = assessed(lists, places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    of = assessed(lists, places={CAR: [(10, 0)]}, episodes={CAR: (0, 0)})
     assert of.error_m.tolist() == [[1.0]]
     assert of.gospa.tolist() == [[4.5]]  # no distance, one false entry
 
@@ -425,7 +425,7 @@ def test_gospa_takes_the_best_pairs_though_the_match_is_another() -> None:
 def test_gospa_leaves_out_what_is_at_objects_not_looked_at() -> None:
     entries = one_list(entry(0.1), entry(10), entry(20), entry(20.5), entry(30))
     places = {CAR: standing(10, 0, 2), OTHER_CAR: standing(20, 0, 2), 3: standing(30, 0, 2)}
-    of = assessed([entries] * 2, places=places, looks={CAR: (0, 1), OTHER_CAR: (1, 1)})
+    of = assessed([entries] * 2, places=places, episodes={CAR: (0, 1), OTHER_CAR: (1, 1)})
     np.testing.assert_array_equal(of.gospa, [[0, 0, np.nan, 4.5]])
     assert figure("gospa_m", of) == figure("gospa_false_m", of) == pytest.approx(math.sqrt(4.5 / 2))
     assert figure("ospa_m", of) == pytest.approx((0 + math.sqrt(9 / 3)) / 2)  # at 1 s two objects and three entries
@@ -433,7 +433,7 @@ def test_gospa_leaves_out_what_is_at_objects_not_looked_at() -> None:
 
 def test_an_unclassified_entry_at_what_is_looked_at_is_believed_but_no_ghost() -> None:
     entries = one_list(entry(10, of="other"), entry(50, of="other"))
-    of = assessed([entries], places={CAR: [(10, 0)]}, looks={CAR: (0, 0)})
+    of = assessed([entries], places={CAR: [(10, 0)]}, episodes={CAR: (0, 0)})
     assert of.gospa.tolist() == [[0.0]]
     assert of.by_run[0]["ghosts"] == 0
     assert of.by_existence["entries"].sum() == 0
@@ -442,11 +442,11 @@ def test_an_unclassified_entry_at_what_is_looked_at_is_believed_but_no_ghost() -
 def test_expected_calibration_error() -> None:
     # Of four entries at 0.85 three are of the car, of two at 0.25 none; ten bins of equal width.
     high, low = [entry(10, existence=0.85)] * 3 + [entry(50, existence=0.85)], [entry(60, existence=0.25)] * 2
-    of = assessed([*high, *low], places={CAR: standing(10, 0, 6)}, looks={CAR: (0, 5)})
+    of = assessed([*high, *low], places={CAR: standing(10, 0, 6)}, episodes={CAR: (0, 5)})
     assert figure("existence_ece", of) == pytest.approx((4 * 0.10 + 2 * 0.25) / 6)
     assert of.by_existence["entries"].tolist() == [[0, 0, 2, 0, 0, 0, 0, 0, 4, 0]]
     assert of.by_existence["with_object"][0, 8] == 3
-    ends = assessed([entry(10, existence=1.0), entry(10, existence=0.0)], places={CAR: standing(10, 0, 2)}, looks={})
+    ends = assessed([entry(10, existence=1.0), entry(10, existence=0.0)], places={CAR: standing(10, 0, 2)}, episodes={})
     assert ends.by_existence["entries"].tolist() == [[1, 0, 0, 0, 0, 0, 0, 0, 0, 1]]
     assert figure("existence_ece", ends) == pytest.approx(0.5)
 
@@ -455,7 +455,7 @@ def test_claims_that_are_too_high_do_not_make_up_for_those_that_are_too_low() ->
     # Two entries at 0.25 are of the car, two at 0.75 of nothing: off by 0.75 each way.
     of = assessed(
         [entry(10, existence=0.25)] * 2 + [entry(50, existence=0.75)] * 2,
-        places={CAR: standing(10, 0, 4)}, looks={CAR: (0, 3)},
+        places={CAR: standing(10, 0, 4)}, episodes={CAR: (0, 3)},
     )  # fmt: skip
     assert figure("existence_ece", of) == pytest.approx(0.75)
 
@@ -464,7 +464,7 @@ def test_bands_of_distance_and_time() -> None:
     # The car is 10, 20, 30 and 40 m away; the list at 2 s misses it, one ghost is 15 m away at 3 s.
     lists = [entry(11), entry(20, 2), NOTHING, one_list(entry(40), entry(0, 15))]
     of = assessed(
-        lists, places={CAR: [(10, 0), (20, 0), (30, 0), (40, 0)]}, looks={CAR: (1, 3)},
+        lists, places={CAR: [(10, 0), (20, 0), (30, 0), (40, 0)]}, episodes={CAR: (1, 3)},
         distance_edges_m=(0.0, 20.0, 40.0), time_edges_s=(1.0, 3.0, 9.0),
     )  # fmt: skip
     near, middle = of.by_distance[0]
@@ -477,40 +477,40 @@ def test_bands_of_distance_and_time() -> None:
     assert (late["pairs"], late["looked"], late["missed"], late["ghosts"]) == (1, 1, 0, 1)
 
 
-def test_no_looks_no_lists() -> None:
-    of = assessed([entry(50), entry(0)], [NOTHING, NOTHING], places={}, looks={})
+def test_no_episodes_no_lists() -> None:
+    of = assessed([entry(50), entry(0)], [NOTHING, NOTHING], places={}, episodes={})
     assert of.by_object.shape == (2, 0)
     assert of.error_m.shape == (2, 0)
     assert of.by_run["ghosts"].tolist() == [1, 0]
     assert figure("false_positives_per_min", of) == pytest.approx(15.0)  # 1 in 2 runs of 2 lists at 1 Hz
     assert all(figure(name, of) is None for name in ("gospa_m", "gospa_false_m", "ospa_m", "longest_gap_s"))
-    of = assessed([], [], places={CAR: []}, looks={CAR: (1, 3)})
+    of = assessed([], [], places={CAR: []}, episodes={CAR: (1, 3)})
     assert of.error_m.shape == of.gospa.shape == (2, 0)
     assert of.by_object["longest_gap_s"].tolist() == [[2.0], [2.0]]
     assert all(figure(name, of) is None for name in FIGURES if name != "longest_gap_s")
 
 
 def test_time_of_irregular_lists_and_of_one() -> None:
-    of = assessed([entry(50)] * 4, times_s=[0, 1, 3, 4], ego=[(0, 0), (0, 0), None, (0, 0)], places={}, looks={})
+    of = assessed([entry(50)] * 4, times_s=[0, 1, 3, 4], ego=[(0, 0), (0, 0), None, (0, 0)], places={}, episodes={})
     assert of.by_run[0]["time_s"] == pytest.approx(3.0)  # three lists, the only neighbours 1 s apart
-    assert figure("false_positives_per_min", assessed([entry(50)], places={}, looks={})) is None
+    assert figure("false_positives_per_min", assessed([entry(50)], places={}, episodes={})) is None
 
 
 def test_totals_of_logs_add() -> None:
-    first = assessed([entry(11)] * 2, places={CAR: standing(10, 0, 2)}, looks={CAR: (0, 1)})
-    other = assessed([entry(12)], [NOTHING], places={CAR: [(10, 0)], OTHER_CAR: [(20, 0)]}, looks={CAR: (0, 0), 2: (0, 0)})  # fmt: skip # noqa: E501
+    first = assessed([entry(11)] * 2, places={CAR: standing(10, 0, 2)}, episodes={CAR: (0, 1)})
+    other = assessed([entry(12)], [NOTHING], places={CAR: [(10, 0)], OTHER_CAR: [(20, 0)]}, episodes={CAR: (0, 0), 2: (0, 0)})  # fmt: skip # noqa: E501
     both = total([first]) + total([other])
     assert accuracy_figures.position_rmse_m(both) == pytest.approx(math.sqrt((1 + 1 + 4) / 3))
     assert (both.rows, both.matched_rows) == (5, 2)
     assert accuracy_figures.gospa_m(both) == pytest.approx(math.sqrt((1 + 1 + 4 + 3 * 4.5) / 4))
     with pytest.raises(ValueError, match="same settings"):
-        total([first]) + total([assessed([entry(1)], places={}, looks={}, cutoff_m=4.0)])
+        total([first]) + total([assessed([entry(1)], places={}, episodes={}, cutoff_m=4.0)])
 
 
 def test_one_run_that_stands_for_all_counts_as_often_as_there_are_runs() -> None:
     lists = [one_list(entry(11, existence=0.7), entry(50)), NOTHING]
     given: dict[str, Any] = {
-        "places": {CAR: standing(10, 0, 2)}, "looks": {CAR: (0, 1)}, "distance_edges_m": (0.0, 60.0),
+        "places": {CAR: standing(10, 0, 2)}, "episodes": {CAR: (0, 1)}, "distance_edges_m": (0.0, 60.0),
         "time_edges_s": (0.0, 2.0), "existence_thresholds": (0.5,),
     }  # fmt: skip
     one, three = assessed(lists, **given), assessed(lists, lists, lists, **given)
@@ -539,7 +539,7 @@ class Scenery:
         watched = sorted(rng.permutation(np.arange(1, N))[: rng.integers(0, N)].tolist())
         onset = rng.uniform(0, 1.5, len(watched))
         span = rng.uniform(0, 2.5, len(watched))
-        self.looks = looks_of({o: (a, a + d) for o, a, d in zip(watched, onset, span, strict=True)})
+        self.episodes = episodes_of({o: (a, a + d) for o, a, d in zip(watched, onset, span, strict=True)})
         self.since_s = onset - rng.choice([0.0, 0.3, -0.1], len(watched))
         self.reference = reference_of([None if rng.uniform() < 0.15 else tuple(rng.normal(0, 1, 2)) for _ in range(K)])
         self.measured = classes(*rng.choice(CLASSES, 8))
@@ -555,7 +555,7 @@ class Scenery:
         self.found = self.matched(self.lists)
         self.rng = rng
 
-    def matched(self, lists: Lists) -> tuple[Matches, Matches]:
+    def matched(self, lists: ObjectLists) -> tuple[Matches, Matches]:
         if self.tells_of_now:
             found = match(lists, self.world, self.scene, gate_m=2.0)
             return found, found
@@ -580,19 +580,19 @@ class Scenery:
             )  # fmt: skip
         return one_list(*entries)
 
-    def of(self, lists: Lists, found: tuple[Matches, Matches]) -> Accuracy:
+    def of(self, lists: ObjectLists, found: tuple[Matches, Matches]) -> Accuracy:
         return assess(
-            lists, *found, self.times, self.world, self.scene, self.looks, self.since_s, self.reference,
+            lists, *found, self.times, self.world, self.scene, self.episodes, self.since_s, self.reference,
             self.measured, settings=self.settings,
         )  # fmt: skip
 
-    def in_stretches(self, cuts: Sequence[float]) -> Accuracy:
+    def in_chunks(self, cuts: Sequence[float]) -> Accuracy:
         """The same, fed with the lists between cuts, their matches, and their instants."""
-        adding = Assessment(
-            self.times, self.scene, self.looks, self.since_s, self.reference, self.measured, settings=self.settings,
+        adding = Aggregator(
+            self.times, self.scene, self.episodes, self.since_s, self.reference, self.measured, settings=self.settings,
             runs=len(self.lists.start),
         )  # fmt: skip
-        for a, b in stretches(cuts, len(self.times)):
+        for a, b in chunks(cuts, len(self.times)):
             lists, rows = between(self.lists, a, b)
             adding.add(
                 lists, *(taken(one, rows) for one in self.found),
@@ -632,7 +632,7 @@ def test_sums_as_the_sentences_have_them(seed: int) -> None:
     expected = plainly(
         made.lists, *made.found, made.times, made.places, made.velocity,
         None if made.tells_of_now else made.captures, made.places_captured,
-        made.looks, made.since_s, made.reference, made.measured, made.settings,
+        made.episodes, made.since_s, made.reference, made.measured, made.settings,
     )  # fmt: skip
     assert_same(found, expected, exactly=False)
 
@@ -654,9 +654,9 @@ def test_runs_by_themselves_are_those_of_all_and_the_order_of_entries_does_not_m
 
 @settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.lists(st.floats(0, 1), max_size=6))
-def test_stretches_add_up_to_the_whole_to_the_last_bit(seed: int, cuts: list[float]) -> None:
+def test_chunks_add_up_to_the_whole_to_the_last_bit(seed: int, cuts: list[float]) -> None:
     made = Scenery(seed)
-    assert_same(made.in_stretches(cuts), made.of(made.lists, made.found))
+    assert_same(made.in_chunks(cuts), made.of(made.lists, made.found))
 
 
 def test_what_is_known_and_as_which_track_goes_on_over_a_cut() -> None:
@@ -664,20 +664,20 @@ def test_what_is_known_and_as_which_track_goes_on_over_a_cut() -> None:
     made = Scenery(0)
     made.times, made.lists = np.arange(4.0), lists_of([lists])
     made.places, made.velocity = {EGO: standing(0, 0, 4), CAR: standing(10, 0, 4)}, {}
-    made.scene, made.looks, made.since_s = scene_of("car", "car"), looks_of({CAR: (0, 3)}), np.zeros(1)
+    made.scene, made.episodes, made.since_s = scene_of("car", "car"), episodes_of({CAR: (0, 3)}), np.zeros(1)
     made.reference = reference_of(standing(0, 0, 4))
     made.world = truth_of(made.places, made.times.tolist())
     made.tells_of_now = True
     made.found = made.matched(made.lists)
-    sums = made.in_stretches([0.5]).by_object[0, 0]
+    sums = made.in_chunks([0.5]).by_object[0, 0]
     assert (sums["switches"], sums["longest_gap_s"]) == (1, 2.0)
 
 
 def test_lists_too_many_or_too_few_are_a_defect() -> None:
     made = Scenery(1)
     none = truth_of({}, [])
-    adding = Assessment(
-        np.arange(2.0), made.scene, made.looks, made.since_s, reference_of([None, None]), made.measured,
+    adding = Aggregator(
+        np.arange(2.0), made.scene, made.episodes, made.since_s, reference_of([None, None]), made.measured,
         settings=made.settings, runs=1,
     )  # fmt: skip
     no_matches = matches_of([], [])
@@ -695,7 +695,7 @@ def test_blocks_of_many_runs_are_summed_as_the_whole_to_the_last_bit(cut: int) -
     rng = np.random.default_rng(3)
     runs = [[entry(*(10 + rng.normal(0, 0.7, 2)), existence=rng.uniform()) for _ in range(2)] for _ in range(200)]
     given: dict[str, Any] = {
-        "places": {CAR: standing(10, 10, 2)}, "looks": {CAR: (0, 1)}, "distance_edges_m": (0.0, 60.0),
+        "places": {CAR: standing(10, 10, 2)}, "episodes": {CAR: (0, 1)}, "distance_edges_m": (0.0, 60.0),
         "time_edges_s": (0.0, 2.0), "existence_thresholds": (0.5,),
     }  # fmt: skip
     whole = assessed(*runs, **given)
@@ -710,7 +710,7 @@ def test_parts_of_objects_add_up_to_gospa(seed: int) -> None:
     truth, shown = rng.uniform(0, 12, (4, 2)), rng.uniform(0, 12, (int(rng.integers(0, 7)), 2))
     of = assessed(
         [one_list(*(entry(x, y) for x, y in shown))], places={o + 1: [tuple(truth[o])] for o in range(4)},
-        looks={o + 1: (0, 0) for o in range(4)}, of=["car"] * 5, ego=[(-50, 0)],
+        episodes={o + 1: (0, 0) for o in range(4)}, of=["car"] * 5, ego=[(-50, 0)],
     )  # fmt: skip
     expected = gospa(truth, shown, cutoff_m=3.0, power=2.0)
     assert figure("gospa_m", of) == pytest.approx(expected.value_m)

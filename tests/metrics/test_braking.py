@@ -567,9 +567,9 @@ def agree(case: Case, driver: ConstantDeceleration, margin_m: float, brake_s: Fl
     """Hold the verdicts of one encounter against the oracle; False where it is not in conflict."""
     log, wanted = case.log(), case.plan(driver, margin_m)
     ready = prepare(log, wanted)
-    if not len(ready.looks.object_ix):
+    if not len(ready.episodes.object_ix):
         return False
-    onset_s = float(ready.looks.onset_s[0])
+    onset_s = float(ready.episodes.onset_s[0])
     pair = motion(log, 0), motion(log, 1)
     free = outcome(*pair, onset_s=onset_s, constant_speed=case.constant_speed)
     if abs(free.min_distance_m - margin_m) > 2e-3:

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from copem_replay.core.object_list import Lists
+from copem_replay.core.object_list import ObjectLists
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_match import Captures, FirstMatches, Steps, captures_of
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 from tests.helpers.at_once import first_matches
-from tests.helpers.reports import between, entry, joined, lists_of, stretches
+from tests.helpers.reports import between, chunks, entry, joined, lists_of
 from tests.metrics.test_by_truth_id import Unit, World, holds, tracks
-from tests.oracles.accuracy import looks_of, matches_of, one_run, permuted, taken
+from tests.oracles.accuracy import episodes_of, matches_of, one_run, permuted, taken
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Item:
     unit_ix: int = 0
 
 
-def listed(runs: Sequence[Sequence[Sequence[Item]]]) -> tuple[Lists, Matches]:
+def listed(runs: Sequence[Sequence[Sequence[Item]]]) -> tuple[ObjectLists, Matches]:
     """Lists from [run][number] with what their entries are."""
     lists = lists_of(
         [
@@ -54,13 +54,13 @@ def of_one_unit(captured_s: Sequence[float]) -> Captures:
 
 
 def found(
-    run: Sequence[Sequence[Item]], issue_s: Sequence[float], *, look: tuple[float, float] = (1.0, 9.0),
+    run: Sequence[Sequence[Item]], issue_s: Sequence[float], *, episode: tuple[float, float] = (1.0, 9.0),
     hits: int = 1, of: int = 1, captured_s: Sequence[float] | None = None, count_earlier: bool = False,
 ) -> tuple[tuple[float, float, int] | None, list[tuple[float, float]]]:  # fmt: skip
     """Of object 7 in one run: detection, capture and unit, and the steps as existence and time."""
     lists, matches = listed([run])
     detections, steps = first_matches(
-        lists, matches, np.array(issue_s, dtype=float), looks_of({7: look}),
+        lists, matches, np.array(issue_s, dtype=float), episodes_of({7: episode}),
         confirm=Confirm(hits=hits, of=of), count_earlier=count_earlier,
         captures=of_one_unit(issue_s if captured_s is None else captured_s),
     )  # fmt: skip
@@ -145,7 +145,7 @@ def of_two_units(lists: Sequence[Sequence[Item]], issue_s: Sequence[float], capt
     """When object 7 is confirmed by two of three."""
     found_lists, matches = listed([lists])
     detections, _ = first_matches(
-        found_lists, matches, np.array(issue_s, dtype=float), looks_of({7: (0.0, 9.0)}),
+        found_lists, matches, np.array(issue_s, dtype=float), episodes_of({7: (0.0, 9.0)}),
         confirm=Confirm(hits=2, of=3), count_earlier=False, captures=captures,
     )  # fmt: skip
     at = float(detections.detection_s[0, 0])
@@ -203,14 +203,14 @@ def test_no_looks_and_no_lists() -> None:
     lists, matches = listed([[[Item(3, 1.0)]], [[]]])
     once, one = np.array([1.0]), Confirm(hits=2, of=2)
     detections, steps = first_matches(
-        lists, matches, once, looks_of({}), confirm=one, count_earlier=False, captures=of_one_unit([1.0])
+        lists, matches, once, episodes_of({}), confirm=one, count_earlier=False, captures=of_one_unit([1.0])
     )
     assert detections.detection_s.shape == (2, 0)
     assert len(steps.run_ix) == len(steps.detection_s) == 0
     lists, matches = listed([[], []])
     none = np.array([])
     detections, steps = first_matches(
-        lists, matches, none, looks_of({3: (0, 1)}), confirm=one, count_earlier=False, captures=of_one_unit([])
+        lists, matches, none, episodes_of({3: (0, 1)}), confirm=one, count_earlier=False, captures=of_one_unit([])
     )
     assert np.isnan(detections.detection_s).all()
     assert detections.first_unit_ix.tolist() == [[-1], [-1]]
@@ -218,7 +218,7 @@ def test_no_looks_and_no_lists() -> None:
 
 
 def plainly(
-    run: Sequence[Sequence[Item]], object_ix: int, look: tuple[float, float], captures: Captures, confirm: Confirm,
+    run: Sequence[Sequence[Item]], object_ix: int, episode: tuple[float, float], captures: Captures, confirm: Confirm,
     count_earlier: bool, at_least: float,
 ) -> float | None:  # fmt: skip
     """One look of one run, list k available at k seconds, of entries of at least some existence."""
@@ -232,9 +232,12 @@ def plainly(
     for k, one in enumerate(run):
         for e in one:
             counts = (
-                e.role in (MATCH, DUPLICATE) and e.object_ix == object_ix and e.existence >= at_least and k <= look[1]
+                e.role in (MATCH, DUPLICATE)
+                and e.object_ix == object_ix
+                and e.existence >= at_least
+                and k <= episode[1]
             )
-            if not counts or (e.captured_s < look[0] and not count_earlier):
+            if not counts or (e.captured_s < episode[0] and not count_earlier):
                 continue
             if confirm.hits == 1:
                 return float(k)
@@ -250,8 +253,8 @@ def plainly(
     return None
 
 
-def asked_for(steps: Steps, run: int, look: int, at_least: float) -> float | None:
-    mine = (steps.run_ix == run) & (steps.look_ix == look)
+def asked_for(steps: Steps, run: int, episode: int, at_least: float) -> float | None:
+    mine = (steps.run_ix == run) & (steps.episode_ix == episode)
     enough = steps.detection_s[mine][steps.existence[mine] >= at_least]
     return float(enough[0]) if len(enough) else None
 
@@ -277,7 +280,7 @@ def items(told: tuple[Any, ...]) -> list[Item]:
 
 @given(
     runs=st.lists(RUN, min_size=1, max_size=3),
-    looks=st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8)), min_size=2, max_size=2),
+    episodes=st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8)), min_size=2, max_size=2),
     first=st.sets(st.integers(0, 8)),
     second=st.sets(st.integers(0, 8)),
     confirm=st.sampled_from([(1, 1), (1, 3), (2, 2), (2, 3), (3, 5)]),
@@ -286,7 +289,7 @@ def items(told: tuple[Any, ...]) -> list[Item]:
     cuts=st.lists(st.floats(0, 1), max_size=5),
 )
 def test_as_the_sentences_have_it(
-    runs: list[Any], looks: list[tuple[int, int]], first: set[int], second: set[int], confirm: tuple[int, int],
+    runs: list[Any], episodes: list[tuple[int, int]], first: set[int], second: set[int], confirm: tuple[int, int],
     count_earlier: bool, seed: int, cuts: list[float],
 ) -> None:  # fmt: skip
     objects = (4, 1)
@@ -294,7 +297,7 @@ def test_as_the_sentences_have_it(
     lists, matches = listed(told)
     asked = Confirm(hits=confirm[0], of=confirm[1])
     issue_s = np.arange(9.0)
-    look_at = dict(zip(objects, looks, strict=True))
+    look_at = dict(zip(objects, episodes, strict=True))
     # Whole seconds: what two units captured in the same one is one instant.
     together = sorted(first | second)
     captured = [*sorted(first), *sorted(second)]
@@ -304,9 +307,9 @@ def test_as_the_sentences_have_it(
         np.array([together.index(t) for t in captured], dtype=int),
     )
 
-    def detect(lists: Lists, matches: Matches) -> Any:
+    def detect(lists: ObjectLists, matches: Matches) -> Any:
         return first_matches(
-            lists, matches, issue_s, looks_of(look_at), confirm=asked, count_earlier=count_earlier, captures=captures
+            lists, matches, issue_s, episodes_of(look_at), confirm=asked, count_earlier=count_earlier, captures=captures
         )
 
     detections, steps = detect(lists, matches)
@@ -324,13 +327,13 @@ def test_as_the_sentences_have_it(
                 assert got[0] == sure
                 stands = [e for e in run[int(sure)] if e.object_ix == o and e.role != GHOST]
                 assert got[1:] in {(e.captured_s, e.unit_ix) for e in stands}
-            mine = (steps.run_ix == s) & (steps.look_ix == m)
+            mine = (steps.run_ix == s) & (steps.episode_ix == m)
             assert (np.diff(steps.existence[mine]) > 0).all()
             assert (np.diff(steps.detection_s[mine]) > 0).all()
         alone, its = one_run(lists, s)
         by_itself, _ = detect(alone, taken(matches, its))
         np.testing.assert_array_equal(by_itself.detection_s[0], detections.detection_s[s])
-    assert (np.diff(steps.run_ix * len(objects) + steps.look_ix) >= 0).all()
+    assert (np.diff(steps.run_ix * len(objects) + steps.episode_ix) >= 0).all()
     shuffled, moved, _ = permuted(lists, matches, np.random.default_rng(seed))
     assert moved is not None
     again, steps_again = detect(shuffled, moved)
@@ -338,9 +341,9 @@ def test_as_the_sentences_have_it(
         np.testing.assert_array_equal(getattr(again, name), getattr(detections, name))
     np.testing.assert_array_equal(steps_again.existence, steps.existence)
     adding = FirstMatches(
-        looks_of(look_at), runs=len(told), confirm=asked, count_earlier=count_earlier, captures=captures
+        episodes_of(look_at), runs=len(told), confirm=asked, count_earlier=count_earlier, captures=captures
     )  # fmt: skip
-    for a, b in stretches(cuts, 9):
+    for a, b in chunks(cuts, 9):
         some, rows = between(lists, a, b)
         adding.add(some, taken(matches, rows), issue_s[a:b])
     for whole, parts in zip((detections, steps), adding.result(), strict=True):
@@ -354,7 +357,7 @@ def test_what_confirms_may_lie_on_both_sides_of_a_cut(cut: int) -> None:
     lists, matches = listed([[[Item(7, 1.0, 0.6)], [Item(7, 2.0, 0.4)], [], [Item(7, 3.0, 0.9)]]])
     issue_s = np.array([1.0, 2.0, 2.5, 3.0])
     adding = FirstMatches(
-        looks_of({7: (0.0, 9.0)}), runs=1, confirm=Confirm(hits=2, of=3), count_earlier=False,
+        episodes_of({7: (0.0, 9.0)}), runs=1, confirm=Confirm(hits=2, of=3), count_earlier=False,
         captures=of_one_unit([1, 2, 3]),
     )  # fmt: skip
     for a, b in ((0, cut), (cut, 4)):
@@ -370,7 +373,7 @@ def test_little_is_remembered_of_what_is_known() -> None:
     times = [float(t) for t in range(1, 200)]
     lists, matches = listed([[[Item(7, t, 0.5 + (t % 10 == 0) * 0.3)] for t in times]] * 2)
     adding = FirstMatches(
-        looks_of({7: (0.0, 999.0)}), runs=2, confirm=Confirm(hits=2, of=3), count_earlier=False,
+        episodes_of({7: (0.0, 999.0)}), runs=2, confirm=Confirm(hits=2, of=3), count_earlier=False,
         captures=of_one_unit(times),
     )  # fmt: skip
     adding.add(lists, matches, np.array(times))

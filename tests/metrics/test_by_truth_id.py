@@ -16,7 +16,7 @@ from copem_replay.core.tracks import VALUES, Tracks
 from copem_replay.fusion.ideal import fuse
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import capture_instants, detect
-from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.episodes import Episodes
 
 NEVER = None
 Held = frozenset[tuple[int, int]]
@@ -37,7 +37,7 @@ class World:
     """Units in the experiment's order, and from when to when each object is looked at."""
 
     units: dict[str, Unit]
-    looks: dict[int, tuple[int, int]]
+    episodes: dict[int, tuple[int, int]]
     runs: int = 1
     hits: int = 1
     of: int = 1
@@ -87,23 +87,23 @@ def tracks(world: World) -> Tracks:
     )
 
 
-def looks(world: World) -> Looks:
-    onset, end = (np.array([look[k] for look in world.looks.values()], dtype=float) / 1000 for k in (0, 1))
+def episodes(world: World) -> Episodes:
+    onset, end = (np.array([episode[k] for episode in world.episodes.values()], dtype=float) / 1000 for k in (0, 1))
     nothing = np.zeros(len(onset), dtype=int)
-    return Looks(np.array(list(world.looks), dtype=int), onset, nothing > 0, end, nothing)
+    return Episodes(np.array(list(world.episodes), dtype=int), onset, nothing > 0, end, nothing)
 
 
 def detected(world: World, heard: Tracks | None = None) -> dict[tuple[int, int], Found | None]:
     """What `detect` says for each run and object, in milliseconds."""
     result = detect(
         tracks(world) if heard is None else heard,
-        looks(world),
+        episodes(world),
         confirm=Confirm(hits=world.hits, of=world.of),
         count_earlier=world.count_earlier,
         max_age_s=world.max_age / 1000,
     )
     found: dict[tuple[int, int], Found | None] = {}
-    for m, o in enumerate(world.looks):
+    for m, o in enumerate(world.episodes):
         for run in range(world.runs):
             at, captured = result.detection_s[run, m], result.captured_s[run, m]
             unit = int(result.first_unit_ix[run, m])
@@ -141,7 +141,7 @@ def plainly(world: World) -> dict[tuple[int, int], Found | None]:
     """Walk through the instants of arrival, run by run and object by object."""
     instant_of = instants_of(world)
     result: dict[tuple[int, int], Found | None] = {}
-    for o, (onset, end) in world.looks.items():
+    for o, (onset, end) in world.episodes.items():
         for run in range(world.runs):
             result[run, o] = NEVER
             holding: list[tuple[int, int, str, int]] = []  # arrived, unit's place, unit, list
@@ -332,10 +332,10 @@ def units(draw: st.DrawFn, runs: int) -> Unit:
 def worlds(draw: st.DrawFn, confirm: bool = True) -> World:
     names = draw(st.sampled_from([("ego",), ("ego", "mast"), ("van", "ego", "mast")]))
     of = draw(st.integers(1, 4)) if confirm else 1
-    looked_at = draw(st.sampled_from([(0,), (1,), (0, 1)]))
+    measured = draw(st.sampled_from([(0,), (1,), (0, 1)]))
     return World(
         units={name: draw(units(runs=2)) for name in names},
-        looks={o: (draw(st.integers(0, 60)) * TICK, draw(st.integers(0, 110)) * TICK) for o in looked_at},
+        episodes={o: (draw(st.integers(0, 60)) * TICK, draw(st.integers(0, 110)) * TICK) for o in measured},
         runs=2,
         hits=draw(st.integers(1, of)),
         of=of,
@@ -363,7 +363,7 @@ def test_capture_instants_against_the_oracle(world: World) -> None:
 def test_detected_when_the_ideal_fusion_first_lists_it(world: World) -> None:
     """From what was captured at or after the onset, as long as we look; nothing is left to confirm."""
     heard = tracks(world)
-    for o, (onset, end) in world.looks.items():
+    for o, (onset, end) in world.episodes.items():
         counted = (heard.row_captured_s >= onset / 1000 - 1e-6) | world.count_earlier
         fused = fuse(replace(heard, valid=heard.valid & counted), max_age_s=world.max_age / 1000).fused
         for run in range(world.runs):
@@ -395,7 +395,7 @@ def test_latency_moves_every_detection_by_itself(world: World, more: int) -> Non
     later = replace(
         world,
         units={name: replace(unit, latency=unit.latency + more * TICK) for name, unit in world.units.items()},
-        looks={o: (onset, end + more * TICK) for o, (onset, end) in world.looks.items()},
+        episodes={o: (onset, end + more * TICK) for o, (onset, end) in world.episodes.items()},
     )
     moved = {key: found and replace(found, at=found.at + more * TICK) for key, found in detected(world).items()}
     assert detected(later) == moved

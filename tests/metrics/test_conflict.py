@@ -1,4 +1,4 @@
-"""When does what the receiver believes imply a collision? A plain oracle in Shapely, and scenes for the head.
+"""When do the receiver's fused tracks imply a collision? A plain oracle in Shapely, and scenes for the head.
 
 The ego of the worked scenes is 4 m × 2 m, a pedestrian 0.5 m × 0.5 m. With a margin of 0.5 m the corridor of an ego
 that drives along y = 0 reaches 1.5 m to either side and 2.5 m ahead of its centre, and so much farther as it drives
@@ -24,16 +24,16 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from copem_replay.cli import main as cli
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.braking.encounter import EgoCourse
+from copem_replay.metrics.braking.encounter import EgoPath
 from copem_replay.metrics.config import Conflict
 from copem_replay.metrics.detection.conflict import _will_be_in, corridors
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers import scenes
@@ -158,9 +158,9 @@ def swept(x_m: float, y_m: float, yaw_rad: float, vx_mps: float, vy_mps: float, 
     return shapely.convex_hull(shapely.union_all(ends))
 
 
-def heard_at(belief: Belief, object_ix: int, issue_s: float, s: int, max_age_s: float) -> float | None:
+def heard_at(fused_tracks: FusedTracks, object_ix: int, issue_s: float, s: int, max_age_s: float) -> float | None:
     """Newest capture of the object in the units' newest lists at an instant; None: in none of them."""
-    heard, newest = belief.heard, None
+    heard, newest = fused_tracks.heard, None
     for unit in range(len(heard.units)):
         came = [
             f
@@ -179,18 +179,18 @@ def heard_at(belief: Belief, object_ix: int, issue_s: float, s: int, max_age_s: 
 
 
 def expected_event(
-    log: Recording, wanted: Experiment, belief: Belief, row: pd.Series, object_ix: int, margin_m: float,
+    log: Recording, wanted: Experiment, fused_tracks: FusedTracks, row: pd.Series, object_ix: int, margin_m: float,
     known: dict[tuple[float, float], np.ndarray],
 ) -> float:  # fmt: skip
     """When the conflict is detected, list by list; NaN: never. `known`: corridors by instant and margin, kept."""
     assert wanted.measure.conflict is not None
     horizon_s, confirm = wanted.measure.conflict.horizon_s, wanted.measure.confirm
-    fused = belief.fused
+    fused = fused_tracks.fused
     implied = [False] * len(fused.stamp_ns)
     for p in np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0]):
         k = int(fused.frame_ix[p])
         now_s = float(fused.arrives_s[0, k])
-        newest = heard_at(belief, object_ix, now_s, 0, max_age_s=1.0)
+        newest = heard_at(fused_tracks, object_ix, now_s, 0, max_age_s=1.0)
         assert newest is not None, "listed, and nobody said so"
         if newest < row["onset_s"] - 1e-9 and not wanted.measure.count_earlier:
             continue
@@ -336,7 +336,7 @@ class TestOracle:
     def test_corridor_is_what_the_ego_sweeps(self, drawn: Drawn, horizon_s: float, margin_m: float) -> None:
         ready = prepare(drawn.log, plan())
         now_s = np.array([-0.1, 0.0, 0.33, 1.2, 2.0, 2.95, 3.0, 3.1])
-        ego = EgoCourse(ready.scene, ready.truth, 0.5)
+        ego = EgoPath(ready.scene, ready.truth, 0.5)
         pieces, bounds = corridors(ego, now_s, Conflict(horizon_s=horizon_s, margin_m=margin_m))
         for k, now in enumerate(now_s):
             found = shapely.union_all(boxes(*pieces[bounds[k] : bounds[k + 1]].T))
@@ -392,11 +392,11 @@ class TestOracle:
         known: dict[tuple[float, float], np.ndarray] = {}
         table = replay_block(ready, wanted, np.arange(2))
         for number in range(2):
-            beliefs = believed(ready, wanted, number)
+            run_tracks = tracks_of_run(ready, wanted, number)
             for _, row in table[table["run"] == number].iterrows():
                 object_ix = drawn.log.scene.object_number[row["object_id"]]
                 early, late = (
-                    expected_event(drawn.log, wanted, beliefs[row["configuration"]], row, object_ix, margin, known)
+                    expected_event(drawn.log, wanted, run_tracks[row["configuration"]], row, object_ix, margin, known)
                     for margin in (margin_m + drawn.tolerance_m, margin_m - drawn.tolerance_m)
                 )
                 found = row["conflict_detection_s"]
@@ -690,7 +690,7 @@ class TestRecordedEgo:
         """It drives 10 m/s ahead and 2 m/s to the left, heading straight ahead: all it sweeps is in its corridor."""
         log = recording([Thing("ego", "car", driving(0, 0, 10, 2))], until_s=4.0)
         ready = prepare(log, plan())
-        pieces, _ = corridors(EgoCourse(ready.scene, ready.truth, 0.5), np.array([0.5]), Conflict())
+        pieces, _ = corridors(EgoPath(ready.scene, ready.truth, 0.5), np.array([0.5]), Conflict())
         found = shapely.union_all(boxes(*pieces.T))
         swept_there = shapely.union_all(corridor_of(log, 0.5, 3.0).boxes(0.5 - 1e-6))
         assert shapely.difference(swept_there, found).area < 1e-9

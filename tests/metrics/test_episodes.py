@@ -12,7 +12,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.detections_table import distances
 from copem_replay.metrics.end_reason import END_REASONS, competes, texts_of
-from copem_replay.metrics.episodes import looks
+from copem_replay.metrics.episodes import episodes
 from copem_replay.perception.visibility import NO_STATICS
 from tests.helpers import scenes
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -20,7 +20,7 @@ from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
 def looked(log: Recording, **changes: object) -> dict[str, tuple[float, bool, float, str]]:
     """Onset, whether it held from the first, end and why, of each object."""
-    found = looks(log.scene, log.truth, NO_STATICS, experiment(**changes))
+    found = episodes(log.scene, log.truth, NO_STATICS, experiment(**changes))
     return {
         log.scene.object_ids[k]: (float(onset_s), bool(at_start), float(ended_s), str(why))
         for k, onset_s, at_start, ended_s, why in zip(

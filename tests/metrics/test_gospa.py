@@ -36,18 +36,18 @@ def pairings(n: int, m: int) -> list[list[tuple[int, int]]]:
     ]
 
 
-def gospa_of_all(truth: Points, believed: Points, c: float, p: float) -> float:
+def gospa_of_all(truth: Points, estimates: Points, c: float, p: float) -> float:
     """The definition with α = 2: the least over all pairings."""
-    n, m = len(truth), len(believed)
+    n, m = len(truth), len(estimates)
     return min(
-        sum(math.dist(truth[i], believed[j]) ** p for i, j in pairs) + c**p / 2 * (n + m - 2 * len(pairs))
+        sum(math.dist(truth[i], estimates[j]) ** p for i, j in pairs) + c**p / 2 * (n + m - 2 * len(pairs))
         for pairs in pairings(n, m)
     ) ** (1 / p)
 
 
-def ospa_of_all(truth: Points, believed: Points, c: float, p: float) -> float:
+def ospa_of_all(truth: Points, estimates: Points, c: float, p: float) -> float:
     """The definition: the shorter list with every choice of as many of the longer, distances cut off at c."""
-    short, long = sorted((truth, believed), key=len)
+    short, long = sorted((truth, estimates), key=len)
     if len(long) == 0:
         return 0.0
     if p == math.inf:
@@ -62,9 +62,9 @@ def ospa_of_all(truth: Points, believed: Points, c: float, p: float) -> float:
     return ((least + c**p * (len(long) - len(short))) / len(long)) ** (1 / p)
 
 
-def by_scipy(truth: Points, believed: Points, c: float, p: float) -> tuple[float, float, list[int]]:
+def by_scipy(truth: Points, estimates: Points, c: float, p: float) -> tuple[float, float, list[int]]:
     """GOSPA, OSPA and the partners: of distances cut off at c, c itself standing for no pair."""
-    distance = np.minimum(np.hypot(*(truth[:, None] - believed).transpose(2, 0, 1)), c)
+    distance = np.minimum(np.hypot(*(truth[:, None] - estimates).transpose(2, 0, 1)), c)
     row, col = linear_sum_assignment(distance**p)
     least, (n, m) = float((distance[row, col] ** p).sum()), distance.shape
     partner = np.full(n, -1)
@@ -85,15 +85,15 @@ def east(points: Points, offset_m: float) -> Points:
 
 @pytest.mark.parametrize(("offset_m", "expected"), [(0.5, 2.5), (1.0, 5.0)])
 def test_gospa_of_power_one_sums_distances(offset_m: float, expected: float):
-    believed = east(FIVE, offset_m)
-    assert gospa(FIVE, believed, cutoff_m=10.0, power=1.0).value_m == pytest.approx(expected, abs=1e-12)
+    estimates = east(FIVE, offset_m)
+    assert gospa(FIVE, estimates, cutoff_m=10.0, power=1.0).value_m == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, math.inf])
 @pytest.mark.parametrize("offset_m", [0.5, 0.2])
 def test_ospa_of_one_offset_is_the_offset(offset_m: float, power: float):
-    believed = east(FIVE[::-1], offset_m)
-    assert ospa(FIVE, believed, cutoff_m=10.0, power=power) == pytest.approx(offset_m, abs=1e-12)
+    estimates = east(FIVE[::-1], offset_m)
+    assert ospa(FIVE, estimates, cutoff_m=10.0, power=power) == pytest.approx(offset_m, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -108,27 +108,27 @@ def test_ospa_of_one_offset_is_the_offset(offset_m: float, power: float):
     ],
 )
 def test_ospa_of_four_for_five(power: float, offset_m: float, expected: float):
-    believed = east(FIVE[:4], offset_m)
-    assert ospa(FIVE, believed, cutoff_m=10.0, power=power) == pytest.approx(expected, abs=5e-6)
-    assert ospa(believed, FIVE, cutoff_m=10.0, power=power) == pytest.approx(expected, abs=5e-6)
+    estimates = east(FIVE[:4], offset_m)
+    assert ospa(FIVE, estimates, cutoff_m=10.0, power=power) == pytest.approx(expected, abs=5e-6)
+    assert ospa(estimates, FIVE, cutoff_m=10.0, power=power) == pytest.approx(expected, abs=5e-6)
 
 
 def test_one_missed_one_false_two_somewhat_off():
     truth = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
-    believed = np.array([[40.0, 0.0], [0.0, 1.0], [10.5, 0.0]])
-    result = gospa(truth, believed, cutoff_m=5.0, power=2.0)
+    estimates = np.array([[40.0, 0.0], [0.0, 1.0], [10.5, 0.0]])
+    result = gospa(truth, estimates, cutoff_m=5.0, power=2.0)
     assert result.value_m == pytest.approx(5.123475, abs=5e-7)
     assert (result.localisation, result.missed, result.false) == (1.25, 12.5, 12.5)
     assert (result.missed_count, result.false_count) == (1, 1)
     assert result.partner.tolist() == [1, 2, -1]
-    assert ospa(truth, believed, cutoff_m=5.0, power=2.0) == pytest.approx(2.958040, abs=5e-7)
+    assert ospa(truth, estimates, cutoff_m=5.0, power=2.0) == pytest.approx(2.958040, abs=5e-7)
 
 
 def test_a_nearest_partner_is_given_up_for_a_better_whole():
     # 1 m and then 3 m away would be 1 + 9; 2 m and 0 m are better.
-    truth, believed = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 0.0], [-2.0, 0.0]])
-    assert gospa(truth, believed, cutoff_m=9.0, power=2.0).partner.tolist() == [1, 0]
-    assert ospa(truth, believed, cutoff_m=9.0, power=math.inf) == 2.0
+    truth, estimates = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 0.0], [-2.0, 0.0]])
+    assert gospa(truth, estimates, cutoff_m=9.0, power=2.0).partner.tolist() == [1, 0]
+    assert ospa(truth, estimates, cutoff_m=9.0, power=math.inf) == 2.0
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0])
@@ -161,25 +161,25 @@ def test_of_empty_lists(power: float):
 
 
 @given(point_sets(4), point_sets(4), cutoffs, powers)
-def test_no_pairing_is_better(truth: Points, believed: Points, c: float, p: float):
-    assert gospa(truth, believed, cutoff_m=c, power=p).value_m == pytest.approx(gospa_of_all(truth, believed, c, p))
+def test_no_pairing_is_better(truth: Points, estimates: Points, c: float, p: float):
+    assert gospa(truth, estimates, cutoff_m=c, power=p).value_m == pytest.approx(gospa_of_all(truth, estimates, c, p))
 
 
 @given(point_sets(4), point_sets(4), cutoffs, powers | st.just(math.inf))
-def test_ospa_is_what_its_definition_says(truth: Points, believed: Points, c: float, p: float):
-    assert ospa(truth, believed, cutoff_m=c, power=p) == pytest.approx(ospa_of_all(truth, believed, c, p))
+def test_ospa_is_what_its_definition_says(truth: Points, estimates: Points, c: float, p: float):
+    assert ospa(truth, estimates, cutoff_m=c, power=p) == pytest.approx(ospa_of_all(truth, estimates, c, p))
 
 
 @given(point_sets(6), point_sets(6), cutoffs, powers)
-def test_the_parts_are_those_of_the_pairs_and_sum_up(truth: Points, believed: Points, c: float, p: float):
-    result = gospa(truth, believed, cutoff_m=c, power=p)
+def test_the_parts_are_those_of_the_pairs_and_sum_up(truth: Points, estimates: Points, c: float, p: float):
+    result = gospa(truth, estimates, cutoff_m=c, power=p)
     pairs = [(i, j) for i, j in enumerate(result.partner.tolist()) if j >= 0]
     assert len({j for _, j in pairs}) == len(pairs)
-    distances = [math.dist(truth[i], believed[j]) for i, j in pairs]
+    distances = [math.dist(truth[i], estimates[j]) for i, j in pairs]
     assert all(d < c for d in distances)
     assert result.localisation == pytest.approx(sum(d**p for d in distances))
     assert result.missed_count == len(truth) - len(pairs)
-    assert result.false_count == len(believed) - len(pairs)
+    assert result.false_count == len(estimates) - len(pairs)
     assert result.missed == pytest.approx(c**p / 2 * result.missed_count)
     assert result.false == pytest.approx(c**p / 2 * result.false_count)
     assert result.value_m**p == pytest.approx(result.localisation + result.missed + result.false)
@@ -190,20 +190,20 @@ def test_the_parts_are_those_of_the_pairs_and_sum_up(truth: Points, believed: Po
 def test_of_many_points_it_is_what_scipy_finds(seed: int, power: float):
     rng = np.random.default_rng(seed)
     n, m = rng.integers(1, 60, 2)
-    truth, believed = rng.uniform(0.0, 30.0, (n, 2)), rng.uniform(0.0, 30.0, (m, 2))
-    expected, expected_ospa, partner = by_scipy(truth, believed, 5.0, power)
-    result = gospa(truth, believed, cutoff_m=5.0, power=power)
+    truth, estimates = rng.uniform(0.0, 30.0, (n, 2)), rng.uniform(0.0, 30.0, (m, 2))
+    expected, expected_ospa, partner = by_scipy(truth, estimates, 5.0, power)
+    result = gospa(truth, estimates, cutoff_m=5.0, power=power)
     assert result.value_m == pytest.approx(expected, rel=1e-12)
     assert result.partner.tolist() == partner
-    assert ospa(truth, believed, cutoff_m=5.0, power=power) == pytest.approx(expected_ospa, rel=1e-12)
+    assert ospa(truth, estimates, cutoff_m=5.0, power=power) == pytest.approx(expected_ospa, rel=1e-12)
 
 
 def test_the_kernel_says_what_the_function_says():
     rng = np.random.default_rng(5)
-    truth, believed = rng.uniform(0.0, 30.0, (15, 2)), rng.uniform(0.0, 30.0, (17, 2))
-    expected = gospa(truth, believed, cutoff_m=5.0, power=2.0)
+    truth, estimates = rng.uniform(0.0, 30.0, (15, 2)), rng.uniform(0.0, 30.0, (17, 2))
+    expected = gospa(truth, estimates, cutoff_m=5.0, power=2.0)
     partner = np.full(15, 99)
-    columns = [np.ascontiguousarray(column) for column in (*truth.T, *believed.T)]
+    columns = [np.ascontiguousarray(column) for column in (*truth.T, *estimates.T)]
     localisation, pairs = gospa_pairs(*columns, 5.0, 2.0, partner)
     assert (localisation, pairs) == (expected.localisation, 15 - expected.missed_count)
     assert partner.tolist() == expected.partner.tolist()
@@ -219,12 +219,12 @@ def test_for_the_kernel_nan_is_near_to_nothing():
 # --------------------------------------------------------------------------------------- a metric
 
 
-def values(truth: Points, believed: Points, c: float, p: float) -> list[float]:
+def values(truth: Points, estimates: Points, c: float, p: float) -> list[float]:
     """Both metrics, and OSPA of infinite power."""
     return [
-        gospa(truth, believed, cutoff_m=c, power=p).value_m,
-        ospa(truth, believed, cutoff_m=c, power=p),
-        ospa(truth, believed, cutoff_m=c, power=math.inf),
+        gospa(truth, estimates, cutoff_m=c, power=p).value_m,
+        ospa(truth, estimates, cutoff_m=c, power=p),
+        ospa(truth, estimates, cutoff_m=c, power=math.inf),
     ]
 
 

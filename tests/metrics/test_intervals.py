@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.metrics.intervals import (
     Resamples,
     alike_limits,
@@ -72,8 +72,8 @@ def test_many_clusters_are_drawn_part_by_part_as_well_as_at_once():
     drawn = resamples(names, 5).count
     assert (drawn.sum(axis=1) == 3000).all()
     zeros = np.zeros(3000, dtype=np.int64)
-    uniform = Dice(5, "summary").uniform(
-        "bootstrap", Address(("",), zeros, object_words(names), zeros), np.arange(1998, 2000)
+    uniform = CounterRng(5, "summary").uniform(
+        "bootstrap", RandomKey(("",), zeros, object_words(names), zeros), np.arange(1998, 2000)
     )
     assert drawn[1998:].tolist() == [np.bincount((u * 3000).astype(int), minlength=3000).tolist() for u in uniform]
 
@@ -134,10 +134,10 @@ def test_no_cluster_has_no_tail():
 @pytest.mark.long
 def test_intervals_over_few_clusters_hold_the_mean_as_often_as_they_say():
     """Means of 5 clusters of equal size: plain percentiles hold it 85 times of 100; these at least 91."""
-    dice = np.random.default_rng(11)
+    rng = np.random.default_rng(11)
     held = 0
     for _ in range(400):
-        shares = dice.beta(4, 4, 5)
+        shares = rng.beta(4, 4, 5)
         successes, totals = np.rint(shares * 10_000).astype(int), np.full(5, 10_000)
         low, high = bootstrap_share(successes, totals, every_resample(5))
         held += low <= 0.5 <= high

@@ -22,7 +22,7 @@ DIGITS = 450
 
 # ------------------------------------------------------------------------------------- the oracle, in 450 digits
 
-Lists = Sequence[tuple[int, float, int]]
+ObjectLists = Sequence[tuple[int, float, int]]
 """Instant, probability, unit."""
 Law = Callable[[Any], tuple[list[Any], Any]]
 """Given δ: how probably it is first known at each instant, and never."""
@@ -36,7 +36,7 @@ def shifted(p: float, delta: Any) -> Any:
     return odds / (1 + odds)
 
 
-def by_the_first(lists: Lists, share: Sequence[float], count: int) -> Law:
+def by_the_first(lists: ObjectLists, share: Sequence[float], count: int) -> Law:
     """Whoever is there is known of by one of its lists; who is there is summed over, one unit at a time."""
 
     def law(delta: Any) -> tuple[list[Any], Any]:
@@ -55,7 +55,7 @@ def by_the_first(lists: Lists, share: Sequence[float], count: int) -> Law:
     return law
 
 
-def by_several(lists: Lists, numbers: Sequence[int], hits: int, of: int) -> Law:
+def by_several(lists: ObjectLists, numbers: Sequence[int], hits: int, of: int) -> Law:
     """By the captures of the last window that hold it, from capture to capture, those without a list included."""
 
     def law(delta: Any) -> tuple[list[Any], Any]:
@@ -103,12 +103,12 @@ def assert_near(found: float, expected: Any, rtol: float = 1e-11) -> None:
     assert abs(mpf(found) - expected) <= rtol * abs(expected) + mpf(10) ** -300, (found, mpmath.nstr(expected, 17))
 
 
-def is_known(lists: Lists, share: Sequence[float]) -> FirstKnown:
+def is_known(lists: ObjectLists, share: Sequence[float]) -> FirstKnown:
     instant, p, unit = (np.array(column) for column in zip(*lists, strict=True))
     return first_of(instant * 0.1, p.astype(float), unit.astype(np.int64), np.array(share))
 
 
-def is_confirmed(lists: Lists, numbers: Sequence[int], hits: int, of: int) -> FirstKnown:
+def is_confirmed(lists: ObjectLists, numbers: Sequence[int], hits: int, of: int) -> FirstKnown:
     instant, p, _ = (np.array(column) for column in zip(*lists, strict=True))
     return confirmed(np.array(numbers)[instant], np.array(numbers)[instant] * 0.1, p.astype(float), hits, of)
 
@@ -126,7 +126,9 @@ SHARES = st.one_of(
 
 
 @st.composite
-def several_lists(draw: st.DrawFn, units: int, kinds: st.SearchStrategy[float] = PROBABILITIES) -> tuple[Lists, int]:
+def several_lists(
+    draw: st.DrawFn, units: int, kinds: st.SearchStrategy[float] = PROBABILITIES
+) -> tuple[ObjectLists, int]:
     """At each of some instants at least one list."""
     count = draw(st.integers(1, 8))
     usual = draw(st.lists(kinds, min_size=1, max_size=3))
@@ -140,7 +142,7 @@ def several_lists(draw: st.DrawFn, units: int, kinds: st.SearchStrategy[float] =
 
 @SOME
 @given(several_lists(3), st.tuples(SHARES, SHARES, SHARES))
-def test_one_hit(made: tuple[Lists, int], share: tuple[float, ...]) -> None:
+def test_one_hit(made: tuple[ObjectLists, int], share: tuple[float, ...]) -> None:
     lists, count = made
     check(is_known(lists, share), by_the_first(lists, share, count))
 
@@ -151,7 +153,7 @@ def test_one_hit(made: tuple[Lists, int], share: tuple[float, ...]) -> None:
     st.sampled_from([(2, 2), (2, 3), (3, 3), (2, 5), (3, 5), (5, 5)]),
     st.lists(st.sampled_from([1, 1, 1, 2, 3, 9]), min_size=8, max_size=8),
 )
-def test_several_hits(made: tuple[Lists, int], confirm: tuple[int, int], gaps: list[int]) -> None:
+def test_several_hits(made: tuple[ObjectLists, int], confirm: tuple[int, int], gaps: list[int]) -> None:
     lists, count = made
     numbers = np.cumsum(gaps[:count]).tolist()
     check(is_confirmed(lists, numbers, *confirm), by_several(lists, numbers, *confirm))
@@ -160,7 +162,7 @@ def test_several_hits(made: tuple[Lists, int], confirm: tuple[int, int], gaps: l
 # ---------------------------------------------------------------------------------------------------- by hand
 
 
-def alike(count: int, p: float) -> Lists:
+def alike(count: int, p: float) -> ObjectLists:
     return [(k, p, 0) for k in range(count)]
 
 

@@ -13,7 +13,7 @@ import pytest
 from copem_replay.core import components
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.episodes import looks
+from copem_replay.metrics.episodes import episodes
 from copem_replay.metrics.onset import ONSETS, Onset, OnsetView, Requires
 from copem_replay.perception.visibility import NO_STATICS
 from copem_replay.report.figures import runs_figure
@@ -132,7 +132,7 @@ def test_an_own_onset_that_fails_is_named(name: str, said: str) -> None:
     log = scenes.oncoming_car()
     plan = scenes.experiment(measure={"onset": {"kind": f"{__name__}:{name}"}})
     with pytest.raises(InputError, match=rf"^measure\.onset: {__name__}:{name}: {said}"):
-        looks(log.scene, log.truth, NO_STATICS, plan)
+        episodes(log.scene, log.truth, NO_STATICS, plan)
 
 
 def test_what_an_own_onset_requires_is_checked(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from copem_replay.fusion.union import Union
 from copem_replay.io.recording import read
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match, match_both
 from copem_replay.pipeline.run import run
-from tests.helpers.reports import entry, joined, lists_of, reports_of
+from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from tests.metrics.test_matching import preference
 from tests.oracles.accuracy import permuted, scene_of, truth_of
@@ -82,7 +82,7 @@ def test_it_is_no_field_of_a_configuration_and_nothing_else() -> None:
 def told() -> Any:
     """Two units; the second one's lists are 0.3 s late."""
     lists = [[entry(float(f)) for f in range(4)]]
-    return reports_of(lists, ["a", "b", "a", "b"], [0.0, 0.1, 0.2, 0.3], [0.0, 0.4, 0.2, 0.6])
+    return inputs_of(lists, ["a", "b", "a", "b"], [0.0, 0.1, 0.2, 0.3], [0.0, 0.4, 0.2, 0.6])
 
 
 @pytest.mark.parametrize("claims", ["its own", "nearly"])

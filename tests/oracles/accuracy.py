@@ -11,10 +11,10 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammainc
 
-from copem_replay.core.object_list import Lists
+from copem_replay.core.object_list import ObjectLists
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES, Scene, Tracks
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Accuracy, Settings
-from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.episodes import Episodes
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches
 from copem_replay.metrics.reference import Reference
 
@@ -66,11 +66,11 @@ def scene_of(*classes: str) -> Scene:
     )
 
 
-def looks_of(looks: Mapping[int, tuple[float, float]]) -> Looks:
+def episodes_of(episodes: Mapping[int, tuple[float, float]]) -> Episodes:
     """Onset and end by object."""
-    onset, end = (np.array([look[q] for look in looks.values()], dtype=float) for q in (0, 1))
+    onset, end = (np.array([episode[q] for episode in episodes.values()], dtype=float) for q in (0, 1))
     nothing = np.zeros(len(onset), dtype=int)
-    return Looks(np.array(list(looks), dtype=int), onset, nothing > 0, end, nothing)
+    return Episodes(np.array(list(episodes), dtype=int), onset, nothing > 0, end, nothing)
 
 
 def reference_of(places: Sequence[tuple[float, float] | None]) -> Reference:
@@ -91,9 +91,9 @@ def band_of(edges: Sequence[float], value: float) -> int | None:
     return None
 
 
-def best_pairs(truth: Array, believed: Array, cutoff_m: float, power: float) -> dict[int, tuple[int, float]]:
+def best_pairs(truth: Array, estimates: Array, cutoff_m: float, power: float) -> dict[int, tuple[int, float]]:
     """Of each truth that has one the partner and the distance."""
-    away = np.array([[np.hypot(*(t - b)) for b in believed] for t in truth]).reshape(len(truth), len(believed))
+    away = np.array([[np.hypot(*(t - b)) for b in estimates] for t in truth]).reshape(len(truth), len(estimates))
     cost = np.minimum(away, cutoff_m) ** power
     return {
         int(i): (int(j), float(away[i, j]))
@@ -124,15 +124,15 @@ def expected_of(entry: Any, gate_m: float) -> tuple[float, float, float]:
 
 
 def plainly(
-    lists: Lists, about: Matches, now: Matches, issue_s: Array, places: Places,
+    lists: ObjectLists, about: Matches, now: Matches, issue_s: Array, places: Places,
     velocity: Mapping[int, tuple[float, float]], captures_s: Sequence[float] | None, places_captured: Places,
-    looks: Looks, stay_from_s: Array, reference: Reference, measured: Array, settings: Settings,
+    episodes: Episodes, stay_from_s: Array, reference: Reference, measured: Array, settings: Settings,
 ) -> Accuracy:  # fmt: skip
     """The same as `assess`, by the sentences of its module. `captures_s`: None, entries tell of now."""
-    S, K, M = len(lists.start), len(issue_s), len(looks.object_ix)
+    S, K, M = len(lists.start), len(issue_s), len(episodes.object_ix)
     edges = {"by_distance": settings.distance_edges_m, "by_time": settings.time_edges_s}
     window = [
-        [k for k in range(K) if stay_from_s[m] - SAME_S <= issue_s[k] <= looks.ended_s[m] + SAME_S] for m in range(M)
+        [k for k in range(K) if stay_from_s[m] - SAME_S <= issue_s[k] <= episodes.ended_s[m] + SAME_S] for m in range(M)
     ]
     column = {(m, k): c for c, (m, k) in enumerate((m, k) for m in range(M) for k in window[m])}
     by_object, by_run = np.zeros((S, M), OBJECT), np.zeros(S, RUN)
@@ -161,7 +161,7 @@ def plainly(
         return [banded[name][s, d : d + 1] for name, d in found.items() if d is not None]
 
     for s in range(S):
-        for m, o in enumerate(looks.object_ix):
+        for m, o in enumerate(episodes.object_ix):
             stay = [k for k in window[m] if k in present and at(o, k) is not None]
             known: list[tuple[float, bool]] = []
             tracks: list[int] = []
@@ -173,10 +173,10 @@ def plainly(
                     if now.object_ix[i] == o and now.role[i] == MATCH:
                         mine.append(lists.entries[i])
                     if now.object_ix[i] == o and now.role[i] == DUPLICATE:
-                        by_object[s, m]["duplicates"] += issue_s[k] >= looks.onset_s[m] - SAME_S
+                        by_object[s, m]["duplicates"] += issue_s[k] >= episodes.onset_s[m] - SAME_S
                 assert len(mine) <= 1
                 known.append((float(issue_s[k]), bool(mine)))
-                if issue_s[k] >= looks.onset_s[m] - SAME_S:
+                if issue_s[k] >= episodes.onset_s[m] - SAME_S:
                     for one in [by_object[s, m : m + 1], *bands(s, k, place)]:
                         one["looked"] += 1
                         one["missed"] += not mine
@@ -226,20 +226,20 @@ def plainly(
                 by_object[s, m]["velocity_square_m2ps2"] += speed @ speed
             by_object[s, m]["tracked"] = len(tracks)
             by_object[s, m]["switches"] = sum(a != b for a, b in pairwise(tracks))
-            by_object[s, m]["longest_gap_s"] = longest_unknown(known, looks.onset_s[m], looks.ended_s[m])
+            by_object[s, m]["longest_gap_s"] = longest_unknown(known, episodes.onset_s[m], episodes.ended_s[m])
         for k in present:
             here = [
                 (m, place)
-                for m, o in enumerate(looks.object_ix)
+                for m, o in enumerate(episodes.object_ix)
                 if (place := at(o, k)) is not None
                 and k in window[m]
-                and looks.onset_s[m] - SAME_S <= issue_s[k] <= looks.ended_s[m] + SAME_S
+                and episodes.onset_s[m] - SAME_S <= issue_s[k] <= episodes.ended_s[m] + SAME_S
             ]
-            believed = []
+            estimates = []
             for i in range(lists.start[s, k], lists.start[s, k + 1]):
                 entry, role, o = lists.entries[i], now.role[i], now.object_ix[i]
                 place = np.array([entry["x_m"], entry["y_m"]])
-                by_run[s]["duplicates"] += role == DUPLICATE and o in looks.object_ix
+                by_run[s]["duplicates"] += role == DUPLICATE and o in episodes.object_ix
                 is_measured = bool(measured[likely(entry)])
                 if is_measured:
                     claim = by_existence[s, min(int(entry["existence"] * 10), 9)]
@@ -257,15 +257,15 @@ def plainly(
                     h = nearest_of(here, place)
                     if h is not None:
                         by_object[s, here[h][0]]["ghosts"] += 1
-                    believed.append(place)
-                elif role != GHOST and o in [looks.object_ix[m] for m, _ in here]:
-                    believed.append(place)
+                    estimates.append(place)
+                elif role != GHOST and o in [episodes.object_ix[m] for m, _ in here]:
+                    estimates.append(place)
             if not here:
                 continue
             by_run[s]["lists_looked"] += 1
             unit = settings.cutoff_m**settings.power
             pairs = best_pairs(
-                np.array([place for _, place in here]), np.array(believed), settings.cutoff_m, settings.power
+                np.array([place for _, place in here]), np.array(estimates), settings.cutoff_m, settings.power
             )
             parts = {h: [0.0, 0.0, 0.0] for h in range(len(here))}
             for h in parts:
@@ -273,15 +273,15 @@ def plainly(
                     parts[h][0] = pairs[h][1] ** settings.power
                 else:
                     parts[h][1] = unit / 2
-            for b in set(range(len(believed))) - {b for b, _ in pairs.values()}:
-                h = nearest_of(here, believed[b])
+            for b in set(range(len(estimates))) - {b for b, _ in pairs.values()}:
+                h = nearest_of(here, estimates[b])
                 assert h is not None
                 parts[h][2] += unit / 2
             for h, (m, _) in enumerate(here):
                 for q, name in enumerate(("localisation", "missed", "false")):
                     by_object[s, m][f"gospa_{name}"] += parts[h][q]
                 gospa[s, column[m, k]] = sum(parts[h])
-            most = max(len(here), len(believed))
+            most = max(len(here), len(estimates))
             total = sum(d**settings.power for _, d in pairs.values()) + unit * (most - len(pairs))
             by_run[s]["ospa_m"] += (total / most) ** (1 / settings.power)
     return Accuracy(
@@ -301,22 +301,24 @@ def plainly(
 def longest_unknown(known: list[tuple[float, bool]], onset_s: float, ended_s: float) -> float:
     """The longest stretch of [onset, end] in which the last list said so far held no match."""
     changes = sorted({onset_s, ended_s, *(min(max(t, onset_s), ended_s) for t, _ in known)})
-    longest = stretch = 0.0
+    longest = chunk = 0.0
     for begin, end in pairwise(changes):
         said = [is_known for t, is_known in known if t <= begin + SAME_S]
-        stretch = 0.0 if said and said[-1] else stretch + end - begin
-        longest = max(longest, stretch)
+        chunk = 0.0 if said and said[-1] else chunk + end - begin
+        longest = max(longest, chunk)
     return longest
 
 
-def permuted(lists: Lists, matches: Matches | None, rng: np.random.Generator) -> tuple[Lists, Matches | None, Array]:
+def permuted(
+    lists: ObjectLists, matches: Matches | None, rng: np.random.Generator
+) -> tuple[ObjectLists, Matches | None, Array]:
     """The same lists, each in another order, and where each entry came from."""
     to = np.arange(len(lists.entries))
     for start in lists.start:
         for a, b in pairwise(start):
             to[a:b] = a + rng.permutation(b - a)
     moved = None if matches is None else taken(matches, to)
-    return Lists(lists.start, lists.entries[to]), moved, to
+    return ObjectLists(lists.start, lists.entries[to]), moved, to
 
 
 def matches_of(object_ix: Sequence[int], role: Sequence[int]) -> Matches:
@@ -330,7 +332,7 @@ def taken(matches: Matches, rows: Any) -> Matches:
     return Matches(*(column[rows] for column in vars(matches).values()))
 
 
-def one_run(lists: Lists, run: int) -> tuple[Lists, slice]:
+def one_run(lists: ObjectLists, run: int) -> tuple[ObjectLists, slice]:
     """The lists of one run by itself, and which entries they are."""
     first, last = int(lists.start[run, 0]), int(lists.start[run, -1])
-    return Lists(lists.start[run : run + 1] - first, lists.entries[first:last]), slice(first, last)
+    return ObjectLists(lists.start[run : run + 1] - first, lists.entries[first:last]), slice(first, last)

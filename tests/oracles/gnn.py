@@ -15,35 +15,35 @@ from scipy.optimize import linear_sum_assignment, minimize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from copem_replay.core.object_list import Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
-from tests.helpers.reports import reports_of
+from tests.helpers.reports import inputs_of
 
 Array = npt.NDArray[Any]
 
 
 def fuse(
-    reports: Reports,
+    inputs: Inputs,
     *,
     combine: str = "inverse_variance",
     minimise: str = "trace",
     gate: float = 0.99,
     min_existence: float = 0.0,
-) -> Lists:
+) -> ObjectLists:
     """The fused lists of all runs."""
     ends, fused = [], [entries_of(0)]
     total = 0
-    for run in range(len(reports.lists.start)):
+    for run in range(len(inputs.lists.start)):
         ends.append([total])
-        for newest in reports.newest:
+        for newest in inputs.newest:
             lists = []
             for f in newest[newest >= 0]:
-                one = reports.lists.of(run, f)
-                lists.append((one[one["existence"] >= min_existence], reports.captured_s[f], reports.arrives_s[f]))
+                one = inputs.lists.of(run, f)
+                lists.append((one[one["existence"] >= min_existence], inputs.captured_s[f], inputs.arrives_s[f]))
             fused.append(fuse_instant(lists, combine=combine, minimise=minimise, gate=gate))
             total += len(fused[-1])
             ends[-1].append(total)
-    return Lists(np.array(ends, dtype=np.int64), np.concatenate(fused))
+    return ObjectLists(np.array(ends, dtype=np.int64), np.concatenate(fused))
 
 
 def fuse_instant(lists: Sequence[tuple[Entries, float, float]], *, combine: str, minimise: str, gate: float) -> Entries:
@@ -229,7 +229,7 @@ def in_any_order(entries: Entries) -> list[bytes]:
 
 def random_reports(
     seed: int, *, units: int, objects: int, captures: int, runs: int = 1, together: bool = False
-) -> Reports:
+) -> Inputs:
     """Units that each list every object with probability 0.8, with the errors they state, ten times a second.
 
     One object per 100 m², moving. `together`: all capture at one instant, else one after the other, unevenly late.
@@ -248,7 +248,7 @@ def random_reports(
             arrives_s.append(at_s + lateness[unit])
             for run in range(runs):
                 lists[run].append(_random_list(rng, place + speed * at_s, speed))
-    return reports_of(lists, names, captured_s, arrives_s)
+    return inputs_of(lists, names, captured_s, arrives_s)
 
 
 def _random_list(rng: np.random.Generator, place: Array, speed: Array) -> Entries:

@@ -11,11 +11,11 @@ import pytest
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.time_chunk import WHOLE
-from copem_replay.core.view_geometry import Errors, Look, Noise
+from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 from copem_replay.fusion.base import Inbox, StepFusion
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
@@ -26,49 +26,49 @@ class NearOnly(DetectionModel):
 
     reach_m: float
 
-    def probability(self, look: Look) -> np.ndarray:
-        return (look.range_m <= self.reach_m).astype(float)
+    def probability(self, view: ViewGeometry) -> np.ndarray:
+        return (view.range_m <= self.reach_m).astype(float)
 
 
 class Crashes(DetectionModel):
-    def probability(self, look: Look) -> np.ndarray:
-        return look.no_such_thing  # type: ignore[attr-defined, no-any-return]
+    def probability(self, view: ViewGeometry) -> np.ndarray:
+        return view.no_such_thing  # type: ignore[attr-defined, no-any-return]
 
 
 class TooMany(DetectionModel):
-    def probability(self, look: Look) -> np.ndarray:
-        return np.ones(len(look.range_m) + 1)
+    def probability(self, view: ViewGeometry) -> np.ndarray:
+        return np.ones(len(view.range_m) + 1)
 
 
 class Percent(DetectionModel):
-    def probability(self, look: Look) -> np.ndarray:
-        return np.full(len(look.range_m), 90.0)
+    def probability(self, view: ViewGeometry) -> np.ndarray:
+        return np.full(len(view.range_m), 90.0)
 
 
 class Shifted(ErrorModel):
     """One metre to the east, always."""
 
-    def perturb(self, look: Look, noise: Noise) -> Errors:
-        zero, n = 0 * noise("east"), len(look.range_m)
+    def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
+        zero, n = 0 * noise("east"), len(view.range_m)
         return Errors(zero + 1.0, zero, np.full(n, 0.01), np.zeros(n), np.full(n, 0.01))
 
 
 class Flat(ErrorModel):
-    def perturb(self, look: Look, noise: Noise) -> Errors:
-        n = len(look.range_m)
+    def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
+        n = len(view.range_m)
         return Errors(np.zeros(n), np.zeros(n), np.ones(n), np.zeros(n), np.ones(n))
 
 
 class Leaves(DetectionModel):
-    def probability(self, look: Look) -> np.ndarray:
+    def probability(self, view: ViewGeometry) -> np.ndarray:
         sys.exit("no model today")  # it leaves
 
 
 class FailsDeeper(DetectionModel):
     """Fails within a library that it calls."""
 
-    def probability(self, look: Look) -> np.ndarray:
-        return np.reshape(look.range_m, (7, 7, 7))  # here
+    def probability(self, view: ViewGeometry) -> np.ndarray:
+        return np.reshape(view.range_m, (7, 7, 7))  # here
 
 
 class Unmakable(DetectionModel):
@@ -79,8 +79,8 @@ class Unmakable(DetectionModel):
             sys.exit(3)
         raise {"fails": RuntimeError("no weights"), "reads": OSError(2, "No such file", "weights.bin")}[self.how]
 
-    def probability(self, look: Look) -> np.ndarray:
-        return look.range_m
+    def probability(self, view: ViewGeometry) -> np.ndarray:
+        return view.range_m
 
 
 def line_of(text: str) -> int:
@@ -101,7 +101,7 @@ def test_own_models_are_used() -> None:
         {"kind": "tests.perception.test_own_models:Shifted"},
     )
     ready = prepare(log, near)
-    fused = believed(ready, near, 0)["PEM"].fused
+    fused = tracks_of_run(ready, near, 0)["PEM"].fused
     first = np.flatnonzero(fused.valid[0])[0]
     assert fused.arrives_s[0, fused.frame_ix[first]] == pytest.approx(7.0), "30 m away at 7 s"
     assert fused.x_m[0, first] == pytest.approx(31.0)
@@ -128,7 +128,7 @@ def test_an_error_model_that_fails_is_named() -> None:
     wrong = plan({"kind": "constant", "probability": 1.0}, {"kind": "tests.perception.test_own_models:Flat"})
     ready = prepare(scenes.oncoming_car(), wrong)
     with pytest.raises(InputError, match=r"^pems\.sure\[0\]\.error: .*east_m: expected shape \(1, 81\), found \(81,\)"):
-        believed(ready, wrong, 0)
+        tracks_of_run(ready, wrong, 0)
 
 
 class Forgotten(DetectionModel):
@@ -190,4 +190,4 @@ def test_a_step_that_gives_something_else_is_named() -> None:
     said += ".*step: expected a list and a memory, found int"
     said += rf" \(.*test_own_models\.py:{line_of('# the step')}\)$"
     with pytest.raises(InputError, match=said):
-        believed(prepare(scenes.oncoming_car(), wrong), wrong, 0)
+        tracks_of_run(prepare(scenes.oncoming_car(), wrong), wrong, 0)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy import stats
 
-from copem_replay.core.random import Address, Dice, object_words
+from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import CLASSES
-from copem_replay.core.view_geometry import Errors, Look, Noise
+from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 from copem_replay.perception.pem.condition import Condition, Couple, applies
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.error import ErrorModel, Gaussian
@@ -24,14 +24,14 @@ from copem_replay.perception.pem.error import ErrorModel, Gaussian
 Array = npt.NDArray[np.float64]
 
 
-def look(
+def view(
     range_m: Sequence[float] = (10.0,),
     *,
     azimuth_deg: float | Sequence[float] = 0.0,
     bearing_deg: float | Sequence[float] = 0.0,
     visible_share: float | Sequence[float] = 1.0,
     kinds: str | Sequence[str] = "car",
-) -> Look:
+) -> ViewGeometry:
     """How rows look; a single value is every row's."""
     n = max(len(v) for v in (range_m, azimuth_deg, bearing_deg, visible_share) if not isinstance(v, float | int))
     n = max(n, 1 if isinstance(kinds, str) else len(kinds))
@@ -40,7 +40,7 @@ def look(
         return np.broadcast_to(np.asarray(values, dtype=float), (n,)).copy()
 
     names = [kinds] * n if isinstance(kinds, str) else list(kinds)
-    return Look(
+    return ViewGeometry(
         range_m=column(range_m),
         azimuth_rad=np.deg2rad(column(azimuth_deg)),
         bearing_rad=np.deg2rad(column(bearing_deg)),
@@ -54,21 +54,21 @@ def look(
     )
 
 
-def holds(seen: Look, **when: Any) -> list[bool]:
+def holds(seen: ViewGeometry, **when: Any) -> list[bool]:
     return Condition.model_validate(when).holds(seen).tolist()
 
 
 class TestConditions:
     def test_nothing_said_holds_always(self) -> None:
-        assert holds(look([0, 1e6], visible_share=0, kinds="other", azimuth_deg=179)) == [True, True]
+        assert holds(view([0, 1e6], visible_share=0, kinds="other", azimuth_deg=179)) == [True, True]
 
     def test_range_bounds_are_included(self) -> None:
-        seen = look([0, 9.999, 10, 10.001, 20, 59.999, 60, 60.001])
+        seen = view([0, 9.999, 10, 10.001, 20, 59.999, 60, 60.001])
         assert holds(seen, range_m=[10, 60]) == [False, False, True, True, True, True, True, False]
         assert holds(seen, range_m=[0, 0]) == [True] + [False] * 7
 
     def test_visible_share_bounds_are_included(self) -> None:
-        seen = look(visible_share=[0, 0.25, 0.3, 0.75, 0.8, 1])
+        seen = view(visible_share=[0, 0.25, 0.3, 0.75, 0.8, 1])
         assert holds(seen, visible_share=[0.25, 0.75]) == [False, True, True, True, False, False]
         assert holds(seen, visible_share=[0, 1]) == [True] * 6
 
@@ -87,18 +87,18 @@ class TestConditions:
         ],
     )
     def test_azimuth(self, azimuth_deg: list[float], within: list[float], without: list[float]) -> None:
-        found = holds(look(azimuth_deg=[*within, *without]), azimuth_deg=azimuth_deg)
+        found = holds(view(azimuth_deg=[*within, *without]), azimuth_deg=azimuth_deg)
         assert found == [True] * len(within) + [False] * len(without)
 
     def test_classes_and_groups(self) -> None:
-        seen = look(kinds=["pedestrian", "bicycle", "motorcycle", "car", "animal", "vehicle"])
+        seen = view(kinds=["pedestrian", "bicycle", "motorcycle", "car", "animal", "vehicle"])
         assert holds(seen, classes=["car", "animal"]) == [False, False, False, True, True, False]
         assert holds(seen, classes=["vru"]) == [True, True, True, False, False, False]
         assert holds(seen, classes=["vehicles"]) == [False, False, True, True, False, True]
         assert holds(seen, classes=["vru", "car"]) == [True, True, True, True, False, False]
 
     def test_all_that_is_given_must_hold(self) -> None:
-        seen = look([5, 50, 5, 5, 5], azimuth_deg=[0, 0, 90, 0, 0], visible_share=[1, 1, 1, 0.1, 1],
+        seen = view([5, 50, 5, 5, 5], azimuth_deg=[0, 0, 90, 0, 0], visible_share=[1, 1, 1, 0.1, 1],
                     kinds=["car", "car", "car", "car", "bus"])  # fmt: skip
         when = {"range_m": [0, 10], "azimuth_deg": [-45, 45], "visible_share": [0.5, 1], "classes": ["car"]}
         assert holds(seen, **when) == [True, False, False, False, False]
@@ -129,26 +129,26 @@ class TestTheFirstThatHolds:
             {"when": {"range_m": [10, 50], "classes": ["vru"]}},
             {"when": {"range_m": [10, 40]}},
         )
-        seen = look([5, 20, 20.5, 30, 45, 45, 60], kinds=["car", "car", "bicycle", "car", "bicycle", "car", "bicycle"])
+        seen = view([5, 20, 20.5, 30, 45, 45, 60], kinds=["car", "car", "bicycle", "car", "bicycle", "car", "bicycle"])
         assert applies(pem, seen).tolist() == [0, 0, 1, 2, 1, -1, -1]
 
     def test_order_decides(self) -> None:
         near, any_ = {"when": {"range_m": [0, 20]}}, {}
-        assert applies(couples(near, any_), look([10, 30])).tolist() == [0, 1]
-        assert applies(couples(any_, near), look([10, 30])).tolist() == [0, 0]
+        assert applies(couples(near, any_), view([10, 30])).tolist() == [0, 1]
+        assert applies(couples(any_, near), view([10, 30])).tolist() == [0, 0]
 
 
-def probability(data: dict[str, Any], seen: Look) -> list[float]:
+def probability(data: dict[str, Any], seen: ViewGeometry) -> list[float]:
     (couple,) = couples({"detection": data})
     return couple.detection.probability(seen).tolist()
 
 
 class TestDetectionModels:
     def test_visible_share(self) -> None:
-        assert probability({"kind": "visible_share"}, look([1, 2, 3], visible_share=[0, 0.37, 1])) == [0, 0.37, 1]
+        assert probability({"kind": "visible_share"}, view([1, 2, 3], visible_share=[0, 0.37, 1])) == [0, 0.37, 1]
 
     def test_constant(self) -> None:
-        seen = look([1, 99], visible_share=[0, 1])
+        seen = view([1, 99], visible_share=[0, 1])
         assert probability({"kind": "constant", "probability": 0.9}, seen) == [0.9, 0.9]
 
     def test_table_between_its_values_and_beyond_them(self) -> None:
@@ -166,20 +166,20 @@ class TestDetectionModels:
             (0, 0.4): 0.2, (200, 0.4): 0.2, (20, 0.0): 0.4, (20, 1.0): 0.7, (0, 0): 0.0, (99, 1): 0.3,  # beyond
         }  # fmt: skip
         ranges, shares = zip(*cases, strict=True)
-        assert probability(table, look(ranges, visible_share=shares)) == pytest.approx(list(cases.values()))
+        assert probability(table, view(ranges, visible_share=shares)) == pytest.approx(list(cases.values()))
 
     def test_table_by_range_alone(self) -> None:
         table = {"kind": "table", "range_m": [0, 50, 100], "probability": [[1.0], [0.5], [0.0]]}
-        seen = look([0, 25, 50, 80, 100, 150], visible_share=[0, 1, 0.3, 0.9, 0.5, 0.1])
+        seen = view([0, 25, 50, 80, 100, 150], visible_share=[0, 1, 0.3, 0.9, 0.5, 0.1])
         assert probability(table, seen) == pytest.approx([1, 0.75, 0.5, 0.2, 0, 0])
 
     def test_table_by_share_alone(self) -> None:
         table = {"kind": "table", "visible_share": [0.1, 0.5], "probability": [[0.0, 1.0]]}
-        seen = look([0, 25, 50, 80], visible_share=[0, 0.2, 0.5, 1])
+        seen = view([0, 25, 50, 80], visible_share=[0, 0.2, 0.5, 1])
         assert probability(table, seen) == pytest.approx([0, 0.25, 1, 1])
 
     def test_table_of_one_value(self) -> None:
-        assert probability({"kind": "table", "probability": [[0.3]]}, look([0, 99])) == [0.3, 0.3]
+        assert probability({"kind": "table", "probability": [[0.3]]}, view([0, 99])) == [0.3, 0.3]
 
     @pytest.mark.parametrize(
         "data",
@@ -214,7 +214,7 @@ class Basis:
         return np.full((1, self.rows), 1.0 if name == self.raised else 0.0)
 
 
-def response(model: ErrorModel, seen: Look) -> tuple[Errors, dict[str, Array]]:
+def response(model: ErrorModel, seen: ViewGeometry) -> tuple[Errors, dict[str, Array]]:
     """Errors without noise, and for each name by how much a noise of 1 moves east and north: (P, 2)."""
     noise = Basis(len(seen.range_m))
     still = model.perturb(seen, noise)
@@ -261,7 +261,7 @@ class TestGaussian:
         mean = [0.7, -0.2]
         model = gaussian(COVARIANCES[name], mean_m=mean, frame=frame)
         degrees = bearing_deg if frame == "line_of_sight" else 0.0
-        still, moved = response(model, look([10.0, 99.0], bearing_deg=bearing_deg))
+        still, moved = response(model, view([10.0, 99.0], bearing_deg=bearing_deg))
         expected = turned(COVARIANCES[name], degrees)
         for row in range(2):
             assert [still.east_m[0, row], still.north_m[0, row]] == pytest.approx(turned(mean, degrees))
@@ -273,7 +273,7 @@ class TestGaussian:
     def test_along_the_line_of_sight_by_hand(self) -> None:
         """An object due north: 3 m further along is 3 m north, 1 m to the left of the line is 1 m west."""
         model = gaussian([[9.0, 0.0], [0.0, 0.01]], mean_m=[3.0, 1.0], frame="line_of_sight")
-        still, _ = response(model, look(bearing_deg=[90.0]))
+        still, _ = response(model, view(bearing_deg=[90.0]))
         assert [still.east_m[0, 0], still.north_m[0, 0]] == pytest.approx([-1.0, 3.0])
         assert [still.cov_ee_m2[0], still.cov_nn_m2[0], still.cov_en_m2[0]] == pytest.approx([0.01, 9.0, 0.0])
 
@@ -286,7 +286,7 @@ class TestGaussian:
         """A product of a matrix with its transpose is one."""
         a = np.array(factor).reshape(2, 2)
         covariance = a @ a.T
-        still, moved = response(gaussian(covariance.tolist(), frame="line_of_sight"), look(bearing_deg=[bearing_deg]))
+        still, moved = response(gaussian(covariance.tolist(), frame="line_of_sight"), view(bearing_deg=[bearing_deg]))
         law = sum(np.outer(by[0], by[0]) for by in moved.values())
         expected, scale = turned(covariance, bearing_deg), 1e-12 + np.abs(covariance).max()
         np.testing.assert_allclose(law, expected, atol=1e-8 * scale)
@@ -301,12 +301,15 @@ class TestGaussian:
         Those of the sample mean are √(Cᵢᵢ / n), those of the sample covariance √((Cᵢᵢ Cⱼⱼ + Cᵢⱼ²) / n).
         """
         n, mean, bearing_deg = 30_000, [0.3, -0.8], 130.0
-        dice, at = Dice(5, "log"), Address(("u",), np.zeros(1, dtype=int), object_words(["7"]), np.array([10**18]))
+        rng, at = (
+            CounterRng(5, "log"),
+            RandomKey(("u",), np.zeros(1, dtype=int), object_words(["7"]), np.array([10**18])),
+        )
 
         def noise(name: str) -> Array:
-            return dice.normal(name, at, np.arange(n))
+            return rng.normal(name, at, np.arange(n))
 
-        errors = gaussian(COVARIANCES[name], mean_m=mean, frame=frame).perturb(look(bearing_deg=[bearing_deg]), noise)
+        errors = gaussian(COVARIANCES[name], mean_m=mean, frame=frame).perturb(view(bearing_deg=[bearing_deg]), noise)
         degrees = bearing_deg if frame == "line_of_sight" else 0.0
         C, centre = turned(COVARIANCES[name], degrees), turned(mean, degrees)
         offsets = np.stack([errors.east_m[:, 0], errors.north_m[:, 0]])
@@ -322,7 +325,7 @@ class TestGaussian:
             assert stats.kstest(across[k] / math.sqrt(width[k]), "norm").pvalue > 1e-3
 
     def test_what_is_not_asked_for_is_exact(self) -> None:
-        errors, moved = response(gaussian([[1, 0], [0, 1]]), look())
+        errors, moved = response(gaussian([[1, 0], [0, 1]]), view())
         assert len(moved) == 2
         assert (errors.yaw_rad, errors.yaw_var_rad2) == (None, None)
         assert (errors.size_m, errors.size_var_m2) == (None, None)
@@ -331,7 +334,7 @@ class TestGaussian:
     def test_yaw_size_and_speed(self) -> None:
         """Standard deviations 18°, 0.2 m, 3 m/s; six errors in all that share no draw with each other."""
         model = gaussian([[1, 0], [0, 1]], yaw_sigma_deg=18.0, size_sigma_m=0.2, speed_sigma_mps=3.0)
-        seen = look([10.0, 20.0])
+        seen = view([10.0, 20.0])
         noise = Basis(2)
         still = model.perturb(seen, noise)
         assert len(noise.names) == 7
@@ -393,7 +396,7 @@ class TestGaussian:
         ],
     )
     def test_what_rounding_left_of_a_singular_one_is_not_blown_up(self, covariance_m2: list[list[float]]) -> None:
-        _, moved = response(gaussian(covariance_m2), look())
+        _, moved = response(gaussian(covariance_m2), view())
         law = sum(np.outer(by[0], by[0]) for by in moved.values())
         np.testing.assert_allclose(law, covariance_m2, atol=2e-5)
 
@@ -411,15 +414,15 @@ class Fading(DetectionModel):
 
     times: float
 
-    def probability(self, look: Look) -> Array:
-        return self.times * look.visible_share
+    def probability(self, view: ViewGeometry) -> Array:
+        return self.times * view.visible_share
 
 
 class Eastward(ErrorModel):
     """A user's own: always one metre too far east."""
 
-    def perturb(self, look: Look, noise: Noise) -> Errors:
-        zeros = np.zeros(len(look.range_m))
+    def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
+        zeros = np.zeros(len(view.range_m))
         return Errors(noise("mine") * 0 + 1.0, noise("mine") * 0, zeros, zeros, zeros)
 
 
@@ -436,9 +439,9 @@ class TestUsersOwn:
             }
         )
         assert type(couple.detection) is Fading
-        assert couple.detection.probability(look(visible_share=[0.2, 1.0])).tolist() == [0.1, 0.5]
+        assert couple.detection.probability(view(visible_share=[0.2, 1.0])).tolist() == [0.1, 0.5]
         assert couple.error is not None
-        assert couple.error.perturb(look([1, 2]), Basis(2)).east_m.tolist() == [[1.0, 1.0]]
+        assert couple.error.perturb(view([1, 2]), Basis(2)).east_m.tolist() == [[1.0, 1.0]]
 
     def test_it_survives_being_written_down(self) -> None:
         couple = Couple.model_validate({"detection": {"kind": f"{__name__}:Fading", "times": 0.5}})

@@ -15,7 +15,7 @@ from scipy import stats
 from copem_replay.core.tracks import VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import Candidates, candidates
+from copem_replay.perception.observation import Observations, observations
 from copem_replay.perception.perceive import perceive
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -58,8 +58,8 @@ def seen(
     plan: Experiment,
     runs: npt.NDArray[np.int64] = RUNS,
     states: Literal["true", "expected", "sampled"] = "sampled",
-) -> tuple[Candidates, Tracks]:
-    found = candidates(log.scene, log.truth, plan)
+) -> tuple[Observations, Tracks]:
+    found = observations(log.scene, log.truth, plan)
     return found, perceive(log.scene, found, plan, runs, states=states)
 
 
@@ -121,7 +121,7 @@ class TestWhoIsListed:
         plan = experiment(visibility="flat", pems={"sure": [{"detection": {"kind": "visible_share"}}]})
         found, of = seen(log, plan)
         (row,) = np.flatnonzero(of.row_object_ix == 1)
-        share = found.look.visible_share[row]
+        share = found.view.visible_share[row]
         assert share == pytest.approx(0.5, abs=1e-3)
         low, high = stats.binom.ppf([5e-7, 1 - 5e-7], len(RUNS), share)
         assert low <= of.valid[:, row].sum() <= high
@@ -294,28 +294,28 @@ class TestHowItLooks:
             units={"mast": {"at": [3, 3], "yaw_deg": 90, "height_m": 6.0, "pem": "all"}},
             configurations={"all": {"units": "all"}},
         )
-        found = candidates(log.scene, log.truth, plan)
+        found = observations(log.scene, log.truth, plan)
         for p, (_, name, _) in enumerate(who(log, found.tracks)):
             dx, dy = {"car": (7, -3), "walker": (-3, 5), "ego": (-3, -3)}[name]
-            assert found.look.range_m[p] == pytest.approx(math.hypot(dx, dy))
-            assert found.look.bearing_rad[p] == pytest.approx(math.atan2(dy, dx))
+            assert found.view.range_m[p] == pytest.approx(math.hypot(dx, dy))
+            assert found.view.bearing_rad[p] == pytest.approx(math.atan2(dy, dx))
             # Forward is north (dy), left is west (−dx).
-            assert found.look.azimuth_rad[p] == pytest.approx(math.atan2(-dx, dy))
-            assert found.look.speed_mps[p] == pytest.approx(5.0 if name == "car" else 0.0)
+            assert found.view.azimuth_rad[p] == pytest.approx(math.atan2(-dx, dy))
+            assert found.view.speed_mps[p] == pytest.approx(5.0 if name == "car" else 0.0)
 
     def test_from_a_carrier_with_an_offset(self) -> None:
         """On the car, which heads north from (10, 0): 2 m forward and 1 m left is (9, 2); it looks backwards."""
         log = square()
         unit = {"on": "car", "offset_m": [2.0, 1.0], "yaw_deg": 180, "height_m": 1.0, "pem": "all"}
-        found = candidates(
+        found = observations(
             log.scene, log.truth, experiment(units={"obu": unit}, configurations={"a": {"units": "all"}})
         )
         names = [name for _, name, _ in who(log, found.tracks)]
         assert sorted(names) == ["ego", "walker"]
         p = names.index("walker")
-        assert found.look.range_m[p] == pytest.approx(math.hypot(9, 6))
+        assert found.view.range_m[p] == pytest.approx(math.hypot(9, 6))
         # Backwards is south, so its left is east: the walker is 6 m behind and 9 m to the right.
-        assert found.look.azimuth_rad[p] == pytest.approx(math.atan2(-9, -6))
+        assert found.view.azimuth_rad[p] == pytest.approx(math.atan2(-9, -6))
 
 
 class TestAddressing:
@@ -328,7 +328,7 @@ class TestAddressing:
 
     def test_fewer_objects_draw_the_same(self) -> None:
         log, plan = square(frames=2), two_units(ego=sees(0.5, ERRORS["all"]), mast=sees(0.5))
-        found = candidates(log.scene, log.truth, plan)
+        found = observations(log.scene, log.truth, plan)
         every = perceive(log.scene, found, plan, np.arange(40))
         walker = perceive(log.scene, found.of_objects(np.array([2])), plan, np.arange(40))
         rows = every.row_object_ix == 2
@@ -346,7 +346,7 @@ class TestAddressing:
 class TestEquipped:
     def test_a_unit_that_a_run_does_not_have_lists_nothing_in_it(self) -> None:
         log, plan = square(frames=2), two_units(ego=sees(1.0), mast=sees(1.0))
-        found = candidates(log.scene, log.truth, plan)
+        found = observations(log.scene, log.truth, plan)
         there = np.array([[True, True], [True, False], [False, True], [False, False]])
         of = perceive(log.scene, found, plan, np.arange(4), equipped=there)
         for run, (ego, mast) in enumerate(there.tolist()):

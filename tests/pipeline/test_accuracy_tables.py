@@ -11,7 +11,7 @@ import pytest
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import blocks as blocks_module
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.scoring import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
@@ -302,7 +302,7 @@ class TestInTheHead:
         assert set(by_id.loc["ideal", "detection_s"]) == {0.5}
         expected_s = []
         for k in range(30):
-            fused = believed(prepare(still(), plan), plan, k)["ideal"].fused
+            fused = tracks_of_run(prepare(still(), plan), plan, k)["ideal"].fused
             times_s = fused.captured_s[fused.frame_ix]
             near = np.hypot(fused.x_m[0] - 20, fused.y_m[0] - 5) <= 3.0
             expected_s.append(times_s[near & (times_s > 0.49)].min())

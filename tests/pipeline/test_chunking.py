@@ -1,4 +1,4 @@
-"""A log in stretches gives what it gives in one piece, to the last bit: tables, summary, MCAP, and what is said."""
+"""A log in time chunks gives what it gives in one piece, to the last bit: tables, summary, MCAP, and what is said."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from copem_replay.cli import main as cli
-from copem_replay.core.object_list import Lists, Reports
-from copem_replay.core.time_chunk import WHOLE, Stretch
+from copem_replay.core.object_list import Inputs, ObjectLists
+from copem_replay.core.time_chunk import WHOLE, TimeChunk
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
@@ -25,10 +25,10 @@ from copem_replay.fusion.base import ListFusion
 from copem_replay.fusion.union import Union
 from copem_replay.io.recording import Recording
 from copem_replay.perception.visibility import visible_shares
-from copem_replay.pipeline import chunking as stretches
+from copem_replay.pipeline import chunking
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.chunking import Reach
-from copem_replay.pipeline.one_run import Beliefs
+from copem_replay.pipeline.one_run import RunTracks
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import listen, seen_by_all
 from copem_replay.pipeline.run import Result, run
@@ -42,12 +42,12 @@ LOGS = Path(__file__).parents[2] / "logs"
 
 
 class AllAtOnce(ListFusion):
-    """A user's own fusion that says nothing of stretches."""
+    """A user's own fusion that says nothing of time chunks."""
 
     kind: str = "tests.pipeline.test_chunking:AllAtOnce"
 
-    def fuse(self, reports: Reports) -> Lists:
-        return Union().fuse(reports)
+    def fuse(self, inputs: Inputs) -> ObjectLists:
+        return Union().fuse(inputs)
 
 
 def shown_in(path: Path) -> dict[str, list[str]]:
@@ -59,16 +59,16 @@ def shown_in(path: Path) -> dict[str, list[str]]:
 
 
 def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: int) -> tuple[Result, Result]:
-    """In one piece, and in stretches of so many candidate rows."""
+    """In one piece, and in time chunks of so many observation rows."""
     whole = run(plan, recordings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stretches, "ROWS_AT_ONCE", 1)
-        patch.setattr(stretches, "ROWS_A_STRETCH", rows_at_once)
+        patch.setattr(chunking, "ROWS_AT_ONCE", 1)
+        patch.setattr(chunking, "ROWS_A_CHUNK", rows_at_once)
         return whole, run(plan, recordings)
 
 
 def assert_same(whole: Result, pieces: Result) -> None:
-    assert [replay.stretches for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
+    assert [replay.chunking for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
     assert whole.notes == pieces.notes
@@ -97,7 +97,7 @@ def test_the_sample_logs(name: str, rows: int, configurations: int | None) -> No
     plan = plan.model_copy(update={"runs": 2, "configurations": chosen})
     recordings, _ = read_logs(plan, log_paths(source)[0], source)
     whole, pieces = both_ways(plan, recordings, rows)
-    assert len(pieces.replays[0].stretches) > 5
+    assert len(pieces.replays[0].chunking) > 5
     assert_same(whole, pieces)
 
 
@@ -166,7 +166,7 @@ def plans(draw: st.DrawFn) -> Experiment:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_whatever_is_replayed(plan: Experiment, rows: int) -> None:
     whole, pieces = both_ways(plan, [traffic()], rows)
-    assert len(pieces.replays[0].stretches) > 1
+    assert len(pieces.replays[0].chunking) > 1
     assert_same(whole, pieces)
 
 
@@ -179,7 +179,7 @@ def test_recorded_units(tmp_path: Path) -> None:
     path = test_recorded.drive(tmp_path / "drive.mcap", *lists)
     plan = test_recorded.plan_of(path, unit={"delay_s": 0.17})
     whole, pieces = both_ways(plan, [test_recorded.read(path, unit={"delay_s": 0.17})], 10)
-    assert len(pieces.replays[0].stretches) > 3
+    assert len(pieces.replays[0].chunking) > 3
     assert_same(whole, pieces)
 
 
@@ -192,7 +192,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
         },
     )  # fmt: skip
     whole, pieces = both_ways(plan, [traffic()], 60)
-    assert len(pieces.replays[0].stretches) > 5
+    assert len(pieces.replays[0].chunking) > 5
     assert whole.table["conflict_detection_s"].notna().any()
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
@@ -216,26 +216,26 @@ def test_a_fusion_that_is_not_resumable_gets_all_at_once() -> None:
     }
     plan = experiment(pems={"sure": NOISY}, configurations=own)
     whole, pieces = both_ways(plan, [traffic()], 50)
-    assert pieces.replays[0].stretches == (WHOLE,)
+    assert pieces.replays[0].chunking == (WHOLE,)
     assert_same(whole, pieces)
 
 
-def test_stretches_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stretches, "ROWS_AT_ONCE", 1)
-    monkeypatch.setattr(stretches, "ROWS_A_STRETCH", 40)
+def test_chunks_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
     log = traffic()
     replay = prepare(log, experiment())
-    cuts = replay.stretches
+    cuts = replay.chunking
     assert (cuts[0].from_s, cuts[-1].until_s) == (-np.inf, np.inf)
     assert all(one.until_s == after.from_s for one, after in pairwise(cuts))
-    rows = [len(replay.found(stretch).tracks.frame_ix) for stretch in cuts]
+    rows = [len(replay.found(time_chunk).tracks.frame_ix) for time_chunk in cuts]
     assert sum(rows) == len(replay.found(WHOLE).tracks.frame_ix)
     assert max(rows) <= 40
-    alone = Beliefs(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
+    alone = RunTracks(replay, experiment(), 0).whole()["GT"].fused  # held at once all the same: it is not that long
     assert len(alone.frame_ix) == len(replay.truth.frame_ix) - 91  # but for the ego
     monkeypatch.setattr("copem_replay.pipeline.one_run.ROWS_HELD", 40)
     with pytest.raises(Exception, match="too long to be held at once; take a window of it"):
-        Beliefs(replay, experiment(), 0).whole()
+        RunTracks(replay, experiment(), 0).whole()
 
 
 def standing_still(frames: int, objects: int) -> Recording:
@@ -252,28 +252,28 @@ def standing_still(frames: int, objects: int) -> Recording:
 
 
 def test_a_log_of_half_a_million_rows_is_cut() -> None:
-    """3000 frames of 60 objects and two units: 3000 · 60 · 3 candidate rows, 200 s in a city at the most."""
+    """3000 frames of 60 objects and two units: 3000 · 60 · 3 observation rows, 200 s in a city at the most."""
     two = {"ego": scenes.EGO_UNIT, "mast": {"at": [0, 9], "height_m": 5.0, "pem": "sure"}}
     log, plan = standing_still(3000, 60), experiment(ego="0", units=two)
-    assert stretches.candidate_rows(log.scene, log.truth, plan) == 540_000
-    cuts = stretches.stretches(log.scene, log.truth, plan)
+    assert chunking.observation_rows(log.scene, log.truth, plan) == 540_000
+    cuts = chunking.time_chunks(log.scene, log.truth, plan)
     assert [(1000 * k + 999.381966) / 10 for k in range(2)] == pytest.approx([cut.until_s for cut in cuts[:-1]])
-    assert stretches.stretches(log.scene, log.truth, experiment(ego="0")) == (WHOLE,)  # 360 000
+    assert chunking.time_chunks(log.scene, log.truth, experiment(ego="0")) == (WHOLE,)  # 360 000
 
 
 @pytest.mark.parametrize("rows_at_once", [10**9, 60])
 def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen up to 20 m only: of all others nothing is drawn, fused or kept."""
-    monkeypatch.setattr(stretches, "ROWS_AT_ONCE", rows_at_once)
-    monkeypatch.setattr(stretches, "ROWS_A_STRETCH", rows_at_once)
+    monkeypatch.setattr(chunking, "ROWS_AT_ONCE", rows_at_once)
+    monkeypatch.setattr(chunking, "ROWS_A_CHUNK", rows_at_once)
     near = [{"when": {"range_m": [0, 20]}, "detection": {"kind": "constant", "probability": 0.5}}]
     plan = experiment(pems={"sure": near})
     replay = prepare(traffic(), plan)
     found = replay.found(WHOLE)
-    listed = np.flatnonzero((found.look.range_m >= 0) & (found.look.range_m < 20))
-    assert 0 < len(listed) < len(found.look.range_m) / 2
-    held = [set(world.found.look.range_m.tolist()) for world in replay.worlds(plan, None)]
-    assert set().union(*held) == set(found.look.range_m[listed].tolist())
+    listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
+    assert 0 < len(listed) < len(found.view.range_m) / 2
+    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, None)]
+    assert set().union(*held) == set(found.view.range_m[listed].tolist())
 
 
 def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,19 +285,19 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
         return visible_shares(world, static, observers, model)
 
     monkeypatch.setattr("copem_replay.perception.observation.visible_shares", counted)
-    monkeypatch.setattr(stretches, "ROWS_AT_ONCE", 1)
-    monkeypatch.setattr(stretches, "ROWS_A_STRETCH", 60)
+    monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 60)
     monkeypatch.setattr("copem_replay.pipeline.blocks.BLOCK_BYTES", 1)
     plan = experiment(runs=3, configurations={"late": {"units": "all", "latency_s": 0.4}}, pems={"sure": NOISY})
     result = run(plan, [traffic()])
     [replay] = result.replays
-    list(Beliefs(replay, plan, 0))
+    list(RunTracks(replay, plan, 0))
     rows = len(replay.truth.frame_ix)
-    # What a stretch needs from before it is looked at with it once more: 0.4 s and a list of 6 objects at 10 Hz.
-    assert rows <= sum(views) <= rows + (len(replay.stretches) - 1) * 6 * 6
+    # What a time chunk needs from before it is looked at with it once more: 0.4 s and a list of 6 objects at 10 Hz.
+    assert rows <= sum(views) <= rows + (len(replay.chunking) - 1) * 6 * 6
 
 
-def test_how_far_back_a_stretch_reaches() -> None:
+def test_how_far_back_a_chunk_reaches() -> None:
     """Lists captured every second arrive 0.4 s later; the receiver goes by each until the next; a tracker by 2 s."""
     plan = experiment(configurations={"ideal": {"units": ["ego"], "latency_s": 0.4}})
     log = scenes.recording([Thing("ego", "car", standing(0, 0))], until_s=10.0, rate_hz=1.0)
@@ -306,17 +306,17 @@ def test_how_far_back_a_stretch_reaches() -> None:
     late = type(late)(**{**{f: getattr(late, f) for f in late.__dataclass_fields__}, "arrives_s": late.arrives_s + 0.4})
     reach = Reach(plan, {"ideal": late})
     # From 5.2 s on: the first instant is 5.4 s, at which the list captured at 5 s arrives.
-    assert reach.earliest_s(Stretch(5.2, 8.0)) == pytest.approx(5.0, abs=0.01)
-    assert reach.earliest_s(Stretch(5.2, 5.3)) == 5.2  # no instant at all
-    assert reach.earliest_s(Stretch(4.8, 8.0)) == pytest.approx(4.8, abs=0.01)
-    assert reach.earliest_s(Stretch()) == -np.inf
+    assert reach.earliest_s(TimeChunk(5.2, 8.0)) == pytest.approx(5.0, abs=0.01)
+    assert reach.earliest_s(TimeChunk(5.2, 5.3)) == 5.2  # no instant at all
+    assert reach.earliest_s(TimeChunk(4.8, 8.0)) == pytest.approx(4.8, abs=0.01)
+    assert reach.earliest_s(TimeChunk()) == -np.inf
     tracker = {"kind": "tracker", "late": "replay", "buffer_s": 2.0}
     replayed = experiment(configurations={"t": {"units": ["ego"], "latency_s": 0.4, "fusion": tracker}})
     # At 5.0 s the newest that has arrived was captured at 4 s: 2 s before that.
-    assert Reach(replayed, {"t": late}).earliest_s(Stretch(5.0, 8.0)) == pytest.approx(2.0, abs=0.01)
+    assert Reach(replayed, {"t": late}).earliest_s(TimeChunk(5.0, 8.0)) == pytest.approx(2.0, abs=0.01)
 
 
-def test_a_stretch_reaches_back_to_a_list_that_another_unit_still_goes_by() -> None:
+def test_a_chunk_reaches_back_to_a_list_that_another_unit_still_goes_by() -> None:
     """One unit's list of 2 s is the newest it has for a second: an instant of the other one at 2.9 s goes by it."""
     plan = experiment(
         units={"ego": scenes.EGO_UNIT, "slow": {"at": [0, 9], "height_m": 5.0, "pem": "sure", "rate_hz": 1.0}},
@@ -326,7 +326,7 @@ def test_a_stretch_reaches_back_to_a_list_that_another_unit_still_goes_by() -> N
     lists = replay.lists_only(plan)
     seen = seen_by_all(lists, np.arange(1), states="true")
     heard = {"ideal": listen(seen, lists.truth, lists.experiment, "ideal")}
-    assert Reach(plan, heard).earliest_s(Stretch(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
+    assert Reach(plan, heard).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 
 def test_the_results_folder(
@@ -347,8 +347,8 @@ def test_the_results_folder(
     monkeypatch.chdir(tmp_path)
     for out, count in (("whole", 10**9), ("pieces", 60)):
         with monkeypatch.context() as patch:
-            patch.setattr(stretches, "ROWS_AT_ONCE", count)
-            patch.setattr(stretches, "ROWS_A_STRETCH", count)
+            patch.setattr(chunking, "ROWS_AT_ONCE", count)
+            patch.setattr(chunking, "ROWS_A_CHUNK", count)
             patch.setattr("sys.argv", ["copem-replay", "run", "plan.yaml", "--out", out])
             with pytest.raises(SystemExit) as ended:
                 cli.main()

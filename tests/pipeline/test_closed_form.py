@@ -182,7 +182,7 @@ def ms(time_s: float) -> int:
 def in_closed_form(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, Times]:
     """What the package says, object by object."""
     result = {}
-    for object_ix, of in zip(ready.looks.object_ix, distributions(ready, plan, name), strict=True):
+    for object_ix, of in zip(ready.episodes.object_ix, distributions(ready, plan, name), strict=True):
         assert (np.diff(of.time_s) > 0).all()
         assert (of.probability >= 0).all()
         times: Times = {ms(t): float(p) for t, p in zip(of.time_s, of.probability, strict=True)}
@@ -196,7 +196,7 @@ def by_detect(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, T
     configuration = plan.configurations[name]
     tracks, probability = ready.measured.tracks, ready.measured.probability
     result = {}
-    for m, object_ix in enumerate(ready.looks.object_ix):
+    for m, object_ix in enumerate(ready.episodes.object_ix):
         mine = tracks.row_object_ix == object_ix
         chance = np.flatnonzero(mine & (probability > 0) & (probability < 1))
         outcomes = np.array(list(itertools.product((True, False), repeat=len(chance))), dtype=bool)
@@ -205,7 +205,7 @@ def by_detect(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, T
         weight = np.where(outcomes, probability[chance], 1 - probability[chance]).prod(axis=1)
         found = detect(
             listen(replace(tracks, valid=valid), ready.truth, plan, name),
-            ready.looks,
+            ready.episodes,
             confirm=plan.measure.confirm,
             count_earlier=plan.measure.count_earlier,
             max_age_s=configuration.max_age_s,
@@ -1117,16 +1117,16 @@ class TestSummary:
     @given(st.data())
     def test_probabilities_are_shares_of_rows(self, data: st.DataObject) -> None:
         """Sixteenths of looks count like so many rows: exact columns are those of a table that repeats them."""
-        looks = data.draw(st.integers(1, 3))
+        episodes = data.draw(st.integers(1, 3))
         rows, table = [], []
-        for k in range(looks):
+        for k in range(episodes):
             ended_s = data.draw(st.sampled_from([0.5, 1.0, 2.0]))
             ended_by = data.draw(st.sampled_from(["object_left", "log_end", "ego_left"]))
             marks = st.one_of(st.none(), st.sampled_from([0.0, 0.25, 0.5]))
             times = data.draw(st.lists(marks, min_size=16, max_size=16))
             base = {"log": "x", "configuration": "c", "object_id": str(k), "onset_s": 0.0, "ended_s": ended_s,
                     "ended_by": ended_by}  # fmt: skip
-            # Of each look there is a row for never, be it that it cannot be.
+            # Of each episode there is a row for never, be it that it cannot be.
             for t, count in ({NEVER: 0} | Counter(times)).items():
                 at = math.nan if t is None else t
                 row = base | {
@@ -1146,9 +1146,9 @@ class TestSummary:
             assert row[f"{name}_exact"] == pytest.approx(row[name], abs=1e-12)
         missed = frame.loc[~frame["detected"], "object_id"].astype(float)
         if len(missed):
-            assert row["miss_log10"] == pytest.approx(math.log10(len(missed) / (16 * looks)), abs=1e-12)
+            assert row["miss_log10"] == pytest.approx(math.log10(len(missed) / (16 * episodes)), abs=1e-12)
             assert row["miss_per_logit"] == pytest.approx(-missed.mean(), abs=1e-12), "by how probable each is"
-            assert row["miss_log10_half_odds"] == pytest.approx(math.log10(missed.nunique() / looks), abs=1e-12)
+            assert row["miss_log10_half_odds"] == pytest.approx(math.log10(missed.nunique() / episodes), abs=1e-12)
         else:
             assert [row[n] for n in ("miss_log10", "miss_per_logit", "miss_log10_half_odds")] == [None] * 3
         for name in ("ttd_p5_s", "ttd_median_s", "ttd_p95_s", "dad_median_m", "dad_p5_m"):

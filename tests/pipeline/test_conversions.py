@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.communication.arrivals import Instants, instants, outrun
-from copem_replay.core.object_list import ENTRY, Entries, Lists, entries_of
+from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule, out_of_sequence
+from copem_replay.core.object_list import ENTRY, Entries, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES, VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import inbox_at
-from copem_replay.fusion.inputs import reports
+from copem_replay.fusion.inputs import inputs
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match
-from copem_replay.pipeline.conversions import as_belief
+from copem_replay.pipeline.conversions import as_fused_tracks
 from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import World, _without_truth, believe, seen_by_all
-from tests.helpers.reports import lists_of, reports_of
+from copem_replay.pipeline.receiver import WorldChunk, _without_truth, receive, seen_by_all
+from tests.helpers.reports import inputs_of, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 Sent = Sequence[tuple[str, float, float]]
@@ -41,11 +41,11 @@ def lists_alone(sent: Sent, units: Sequence[str]) -> Tracks:
     )  # fmt: skip
 
 
-def received(sent: Sent, units: Sequence[str] = ("a", "b"), max_age_s: float = 1.0) -> Instants:
-    return instants(lists_alone(sent, units), max_age_s=max_age_s)
+def received(sent: Sent, units: Sequence[str] = ("a", "b"), max_age_s: float = 1.0) -> FusionSchedule:
+    return fusion_schedule(lists_alone(sent, units), max_age_s=max_age_s)
 
 
-def arrived(at: Instants) -> list[list[int]]:
+def arrived(at: FusionSchedule) -> list[list[int]]:
     return [
         at.arrived[first:last].tolist() for first, last in zip(at.arrived_start, at.arrived_start[1:], strict=False)
     ]
@@ -58,7 +58,7 @@ class TestInstants:
         np.testing.assert_allclose(at.issue_s, [0.3, 0.4, 0.5, 0.6])
         assert at.newest.tolist() == [[0, -1], [2, -1], [2, -1], [3, -1]]
         assert arrived(at) == [[0], [2], [1], [3]]
-        assert outrun(lists_alone(sent, ("a", "b"))).tolist() == [False, True, False, False]
+        assert out_of_sequence(lists_alone(sent, ("a", "b"))).tolist() == [False, True, False, False]
 
     def test_of_lists_that_arrive_together_the_newest_counts(self) -> None:
         at = received([("a", 0.0, 0.5), ("a", 0.2, 0.5), ("a", 0.1, 0.5), ("b", 0.1, 0.5)])
@@ -103,7 +103,7 @@ class TestInstants:
         max_age_s = data.draw(st.sampled_from([0.15, 0.4, 2.0]))
         at = received(sent, "abc", max_age_s)
         whose, captured_s, arrives_s = zip(*sent, strict=True)
-        expected = reports_of([[entries_of(0)] * len(sent)], whose, captured_s, arrives_s, max_age_s, "abc")
+        expected = inputs_of([[entries_of(0)] * len(sent)], whose, captured_s, arrives_s, max_age_s, "abc")
         np.testing.assert_allclose(at.issue_s, expected.issue_s)
         assert at.newest.tolist() == expected.newest.tolist()
         assert arrived(at) == [
@@ -113,7 +113,7 @@ class TestInstants:
 
     def test_the_inbox_is_in_order_of_capture_and_ones_own(self) -> None:
         sent = [("a", 0.2, 0.5), ("b", 0.1, 0.5), ("a", 0.0, 0.5), ("b", 0.3, 0.6), ("b", 0.2, 0.7)]
-        told = reports(lists_alone(sent, ("a", "b")), lists_of([[entries_of(1)] * 5]), max_age_s=1.0)
+        told = inputs(lists_alone(sent, ("a", "b")), lists_of([[entries_of(1)] * 5]), max_age_s=1.0)
         inbox = inbox_at(told, 0, 0)
         assert [(one.unit, one.captured_s) for one in inbox.newest] == [("a", 0.2), ("b", 0.1)]
         assert [(one.unit, one.captured_s) for one in inbox.arrived] == [("a", 0.0), ("b", 0.1), ("a", 0.2)]
@@ -146,18 +146,18 @@ def pem(covariance_m2: Any = None, **more: Any) -> dict[str, Any]:
     return {"p": [{"detection": {"kind": "constant", "probability": more.pop("probability", 1.0)}, **error, **more}]}
 
 
-def world_of(plan: Experiment, log: Recording) -> World:
+def world_of(plan: Experiment, log: Recording) -> WorldChunk:
     return prepare(log, plan).world(plan)
 
 
-def told_in(plan: Experiment, log: Recording, runs: Sequence[int] = (0,)) -> tuple[Tracks, Lists]:
+def told_in(plan: Experiment, log: Recording, runs: Sequence[int] = (0,)) -> tuple[Tracks, ObjectLists]:
     """What the units list with truth ids, and without."""
     world = world_of(plan, log)
     seen = seen_by_all(world, np.array(runs), states="sampled")
     return seen, _without_truth(world, seen, np.array(runs))
 
 
-def as_sets(lists: Lists, run: int = 0) -> list[Counter[bytes]]:
+def as_sets(lists: ObjectLists, run: int = 0) -> list[Counter[bytes]]:
     return [Counter(e.tobytes() for e in lists.of(run, k)) for k in range(lists.start.shape[1] - 1)]
 
 
@@ -219,7 +219,7 @@ class TestWithoutTruth:
         np.testing.assert_allclose(found, np.tile(np.maximum(given, 1e-9), (len(e), 1)), rtol=1e-6, atol=1e-15)
 
 
-def entries_in(lists: Lists, run: int) -> Entries:
+def entries_in(lists: ObjectLists, run: int) -> Entries:
     part: Entries = lists.entries[lists.start[run, 0] : lists.start[run, -1]]
     return part
 
@@ -236,15 +236,15 @@ class TestBackToTracks:
         plan = experiment(pems=pems, units=TWO_UNITS, configurations=self.configurations())
         replay = prepare(crowd(), plan)
         roles: Counter[int] = Counter()
-        for name, told in believe(replay.world(plan), np.arange(3), None):
+        for name, told in receive(replay.world(plan), np.arange(3), None):
             issue_s, newest = told.at.issue_s, told.at.newest
-            matches = match(told.lists, replay.surroundings.at(issue_s), replay.scene, gate_m=3.0)
+            matches = match(told.lists, replay.truth_cache.at(issue_s), replay.scene, gate_m=3.0)
             for s in range(3):
-                belief = as_belief(told.lists, s, matches, told.heard, issue_s, newest)
-                fused, said = belief.fused, belief.said
+                fused_tracks = as_fused_tracks(told.lists, s, matches, told.heard, issue_s, newest)
+                fused, said = fused_tracks.fused, fused_tracks.said
                 assert said is not None
                 assert Counter(map(bytes, said)) == Counter(map(bytes, entries_in(told.lists, s))), name
-                assert np.array_equal(belief.captured_s[0], said["captured_s"])
+                assert np.array_equal(fused_tracks.captured_s[0], said["captured_s"])
                 assert all(np.array_equal(getattr(fused, value)[0], said[value]) for value in VALUES)
                 assert np.bincount(fused.object_ix + 1)[1:].max() == 1, "one track of an object"
                 order, bounds = fused.by_frame
@@ -261,30 +261,30 @@ class TestBackToTracks:
         """With a gate of nothing all are ghosts: a track of each of the tracker's tracks, of each entry of union."""
         plan = experiment(pems=pem([[1, 0], [0, 1]]), units=TWO_UNITS, configurations=self.configurations())
         replay = prepare(crowd(), plan)
-        for name, told in believe(replay.world(plan), np.arange(1), None):
-            matches = match(told.lists, replay.surroundings.at(told.at.issue_s), replay.scene, gate_m=1e-6)
-            belief = as_belief(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
-            assert set(belief.fused.object_ix) == {-1}
+        for name, told in receive(replay.world(plan), np.arange(1), None):
+            matches = match(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=1e-6)
+            fused_tracks = as_fused_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
+            assert set(fused_tracks.fused.object_ix) == {-1}
             ids = entries_in(told.lists, 0)["track_id"]
-            assert len(belief.fused.object_ix) == (len(set(ids)) if name == "tracker" else len(ids))
-            assert len(np.unique(belief.fused.frame_ix)) > 5
+            assert len(fused_tracks.fused.object_ix) == (len(set(ids)) if name == "tracker" else len(ids))
+            assert len(np.unique(fused_tracks.fused.frame_ix)) > 5
 
     def test_ideal_fusion_is_as_sure_of_its_list_as_it_is(self) -> None:
         log = crowd()
         plan = experiment(pems=pem(probability=0.5), units=TWO_UNITS, configurations=self.configurations())
-        told = dict(believe(world_of(plan, log), np.arange(2), None))["ideal"]
-        belief, lists = told.belief, told.lists
-        assert belief is not None
+        told = dict(receive(world_of(plan, log), np.arange(2), None))["ideal"]
+        fused_tracks, lists = told.fused_tracks, told.lists
+        assert fused_tracks is not None
         assert lists.entries.dtype == ENTRY
         assert set(lists.entries["existence"]) == {1.0}
         assert set(lists.entries["track_id"]) == {-1}
         for s in range(2):
-            entries, rows = entries_in(lists, s), np.flatnonzero(belief.fused.valid[s])
-            rows = rows[np.argsort(belief.fused.frame_ix[rows], kind="stable")]
-            assert entries["x_m"].tolist() == belief.fused.x_m[s, rows].tolist()
-            assert entries["captured_s"].tolist() == belief.captured_s[s, rows].tolist()
-            assert entries["unit_ix"].tolist() == belief.first_unit_ix[s, rows].tolist()
-            kinds = log.scene.object_class[belief.fused.row_object_ix[rows]]
+            entries, rows = entries_in(lists, s), np.flatnonzero(fused_tracks.fused.valid[s])
+            rows = rows[np.argsort(fused_tracks.fused.frame_ix[rows], kind="stable")]
+            assert entries["x_m"].tolist() == fused_tracks.fused.x_m[s, rows].tolist()
+            assert entries["captured_s"].tolist() == fused_tracks.captured_s[s, rows].tolist()
+            assert entries["unit_ix"].tolist() == fused_tracks.first_unit_ix[s, rows].tolist()
+            kinds = log.scene.object_class[fused_tracks.fused.row_object_ix[rows]]
             assert entries["class_probability"].argmax(axis=1).tolist() == kinds.tolist()
 
 
@@ -292,8 +292,8 @@ def test_a_belief_of_a_run_without_entries_is_empty() -> None:
     union = {"u": {"units": "all", "fusion": {"kind": "union"}}}
     plan = experiment(pems=pem(probability=0.0), configurations=union, units=TWO_UNITS)
     replay = prepare(crowd(), plan)
-    ((_, told),) = believe(replay.world(plan), np.arange(1), None)
-    matches = match(told.lists, replay.surroundings.at(told.at.issue_s), replay.scene, gate_m=3.0)
-    belief = as_belief(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
-    assert (len(belief.fused.frame_ix), len(belief.fused.object_ix)) == (0, 0)
-    assert len(belief.fused.stamp_ns) == 11, "its lists are there, and empty"
+    ((_, told),) = receive(replay.world(plan), np.arange(1), None)
+    matches = match(told.lists, replay.truth_cache.at(told.at.issue_s), replay.scene, gate_m=3.0)
+    fused_tracks = as_fused_tracks(told.lists, 0, matches, told.heard, told.at.issue_s, told.at.newest)
+    assert (len(fused_tracks.fused.frame_ix), len(fused_tracks.fused.object_ix)) == (0, 0)
+    assert len(fused_tracks.fused.stamp_ns) == 11, "its lists are there, and empty"

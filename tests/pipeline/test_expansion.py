@@ -649,8 +649,8 @@ VISIBLE = (1.8 - (3 - 19.75 / 10.05)) / 1.8
 )
 def test_a_carried_unit_is_on_the_roof_by_default(unit: dict[str, Any], expected: float) -> None:
     ready = prepare(over_a_wall(), plan({"f": unit}))
-    assert len(ready.measured.look.visible_share) == 3
-    assert ready.measured.look.visible_share == pytest.approx(expected, abs=1e-6)
+    assert len(ready.measured.view.visible_share) == 3
+    assert ready.measured.view.visible_share == pytest.approx(expected, abs=1e-6)
 
 
 # -------------------------------------------------------------------------------------------- one run, and results
@@ -694,11 +694,11 @@ class TestOfRun:
         )
         onset = {"onset": {"kind": "line_of_sight_any", "visible_share": 0.5}}
         wanted = plan({"ego": EGO, "f": some(0.5)}, measure={"objects": {"classes": ["pedestrian"]}} | onset)
-        expected = prepare(log, wanted).looks.onset_s.tolist()
+        expected = prepare(log, wanted).episodes.onset_s.tolist()
         assert expected == pytest.approx([2.0], abs=0.15)
         for k in range(6):
             alone = of_run(wanted, log.scene, k)
-            assert prepare(log, alone, onsets_of=wanted).looks.onset_s.tolist() == expected
+            assert prepare(log, alone, onsets_of=wanted).episodes.onset_s.tolist() == expected
 
 
 TEXT = """\

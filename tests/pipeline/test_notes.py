@@ -175,7 +175,7 @@ class TestMemory:
 
     def rows(self, here: Path) -> tuple[Experiment, list[Replay]]:
         experiment, _, ready = made(here, changed("runs: 1000000", "measure: {accuracy: false}"))
-        assert [len(replay.looks.object_ix) for replay in ready] == [1]
+        assert [len(replay.episodes.object_ix) for replay in ready] == [1]
         return experiment, ready
 
     def test_enough(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,17 +13,17 @@ import pytest
 
 from copem_replay.cli import main as cli
 from copem_replay.communication.link import ConstantLink, transmit
-from copem_replay.core.object_list import ENTRY, Lists
+from copem_replay.core.object_list import ENTRY, ObjectLists
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import ListFusion, fused_by
-from copem_replay.fusion.inputs import reports
+from copem_replay.fusion.inputs import inputs
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import blocks as blocks_module
 from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import Believed, _without_truth, believe, seen_by_all
+from copem_replay.pipeline.receiver import ReceiverOutput, _without_truth, receive, seen_by_all
 from copem_replay.pipeline.run import Result, run
 from tests.helpers.experiments import changed, drive
-from tests.helpers.reports import reports_of
+from tests.helpers.reports import inputs_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 FUSIONS: dict[str, dict[str, Any]] = {
@@ -81,7 +81,9 @@ def figures(result: Result, configuration: str) -> pd.Series:
     return result.summary.set_index("configuration").loc[configuration]
 
 
-def same_sets(one: Lists, other: Lists, names: tuple[str, ...], others: tuple[str, ...], *, whose: bool) -> None:
+def same_sets(
+    one: ObjectLists, other: ObjectLists, names: tuple[str, ...], others: tuple[str, ...], *, whose: bool
+) -> None:
     """The same entries in every list, but for rounding; tracks may be numbered otherwise."""
     assert np.diff(one.start).tolist() == np.diff(other.start).tolist()
     number: dict[int, int] = {}
@@ -104,12 +106,12 @@ class TestWhatDoesNotMatter:
         seen = seen_by_all(world, runs, states="sampled")
         lists = _without_truth(world, seen, runs)
         heard = transmit(seen, ConstantLink(latency_s=latency_s), "link")
-        told = reports(heard, lists, max_age_s=1.0)
-        dice = np.random.default_rng(0)
+        told = inputs(heard, lists, max_age_s=1.0)
+        rng = np.random.default_rng(0)
         names = tuple(told.units[k] for k in (2, 0, 1))
-        order = dice.permutation(len(told.unit_ix))
-        other = reports_of(
-            [[dice.permutation(lists.of(s, f)) for f in order] for s in range(3)],
+        order = rng.permutation(len(told.unit_ix))
+        other = inputs_of(
+            [[rng.permutation(lists.of(s, f)) for f in order] for s in range(3)],
             [told.units[told.unit_ix[f]] for f in order],
             told.captured_s[order].tolist(), told.arrives_s[order].tolist(), names=names,
         )  # fmt: skip
@@ -123,9 +125,9 @@ class TestWhatDoesNotMatter:
     def test_the_other_runs(self) -> None:
         plan = noisy()
         world = prepare(crowd(), plan).world(plan)
-        batch = dict(believe(world, np.arange(5), None))
+        batch = dict(receive(world, np.arange(5), None))
         for s in (0, 3):
-            for name, alone in believe(world, np.array([s]), None):
+            for name, alone in receive(world, np.array([s]), None):
                 assert entries_of_run(alone, 0) == entries_of_run(batch[name], s if name != "GT" else 0), name
 
     def test_jobs_and_blocks(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,8 +144,8 @@ class TestWhatDoesNotMatter:
                 assert table.equals(getattr(other.accuracy, name)), name
 
 
-def entries_of_run(believed: Believed, s: int) -> tuple[list[int], bytes]:
-    lists = believed.lists
+def entries_of_run(output: ReceiverOutput, s: int) -> tuple[list[int], bytes]:
+    lists = output.lists
     first, last = lists.start[s, 0], lists.start[s, -1]
     return (lists.start[s] - first).tolist(), lists.entries[first:last].tobytes()
 

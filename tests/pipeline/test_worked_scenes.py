@@ -10,7 +10,7 @@ import pytest
 
 from copem_replay.core.interpolation import at_instants
 from copem_replay.io.recording import Recording
-from copem_replay.perception.observation import candidates
+from copem_replay.perception.observation import observations
 from copem_replay.pipeline.run import Result, run
 from tests.helpers import scenes
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording, standing
@@ -166,7 +166,7 @@ def test_who_leaves_unseen_is_never_detected() -> None:
     summary = of(result, "PEM")
     assert summary["detected_share"] == 0
     assert pd.isna(summary["ttd_median_s"])
-    assert summary["ttd_rmst_s"] == pytest.approx(1.0), "never detected counts as the horizon, the longest look: 1 s"
+    assert summary["ttd_rmst_s"] == pytest.approx(1.0), "never detected counts as the horizon, the longest episode: 1 s"
     assert pd.isna(summary["dad_median_m"])
 
 
@@ -218,14 +218,14 @@ def test_a_unit_on_another_car_sees_past_it() -> None:
         pems={"sure": [{"detection": {"kind": "visible_share"}}]},
         configurations={"PEM": {"units": ["ego"]}, "V2V": {"units": ["v2v"]}},
     )
-    found = candidates(log.scene, log.truth, plan)
+    found = observations(log.scene, log.truth, plan)
     ids = np.array(log.scene.object_ids)[found.tracks.row_object_ix]
     unit = np.array(found.tracks.units)[found.tracks.row_unit_ix]
     assert set(ids[unit == "ego"]) == {"middle", "first"}
     assert set(ids[unit == "v2v"]) == {"ego", "first"}
-    assert found.look.visible_share[(unit == "ego") & (ids == "first")].max() == 0
-    assert found.look.visible_share[(unit == "v2v")].min() == 1
-    assert set(found.look.range_m[(unit == "v2v")].round(9)) == {10.0}
+    assert found.view.visible_share[(unit == "ego") & (ids == "first")].max() == 0
+    assert found.view.visible_share[(unit == "v2v")].min() == 1
+    assert set(found.view.range_m[(unit == "v2v")].round(9)) == {10.0}
     result = run(plan, [log])
     assert not row(result, "PEM", "first")["detected"]
     assert row(result, "V2V", "first")["detected"]
@@ -249,9 +249,9 @@ def test_units_heights_count_from_the_ground_under_them() -> None:
         configurations={"PEM": {"units": "all"}},
     )
     for each in (log, raised):
-        found = candidates(each.scene, each.truth, plan)
+        found = observations(each.scene, each.truth, plan)
         walker = found.tracks.row_object_ix == 1
-        low, mast = (found.look.visible_share[walker & (found.tracks.row_unit_ix == k)] for k in (0, 1))
+        low, mast = (found.view.visible_share[walker & (found.tracks.row_unit_ix == k)] for k in (0, 1))
         assert low == pytest.approx(0.5, abs=1e-3)
         assert mast == pytest.approx(1.0)
 
@@ -279,9 +279,9 @@ def test_an_offset_moves_a_fixed_unit_along_its_own_heading() -> None:
     mast = {"at": [5, 0], "yaw_deg": 90, "offset_m": [3, 4], "height_m": 5.0, "pem": "all"}
     plan = experiment(units={"mast": mast}, configurations={"all": {"units": "all"}}, measure={"distance_to": "mast"})
     log = scenes.oncoming_car()
-    found = candidates(log.scene, log.truth, plan)
+    found = observations(log.scene, log.truth, plan)
     other = found.tracks.row_object_ix == log.scene.object_number["other"]
-    assert found.look.range_m[other][0] == pytest.approx(np.hypot(99, 3))
+    assert found.view.range_m[other][0] == pytest.approx(np.hypot(99, 3))
     result = run(plan, [log])
     distance = row(result, "all")["distance_at_detection_m"]
     assert distance == pytest.approx(np.hypot(100 - 10 * row(result, "all")["detection_s"] - 1, 3))

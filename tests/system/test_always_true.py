@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from copem_replay.core.interpolation import states_at
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.scenes import Thing, driving, experiment, recording
@@ -178,7 +178,7 @@ def test_the_truth_detects_at_the_first_list_from_the_onset_on(log: Recording, o
 def test_the_truth_is_believed_without_error(log: Recording) -> None:
     plan = experiment(configurations={"GT": {"units": "truth"}})
     ready = prepare(log, plan)
-    fused = believed(ready, plan, 0)["GT"].fused
+    fused = tracks_of_run(ready, plan, 0)["GT"].fused
     at, there = states_at(
         log.truth, fused.row_object_ix, fused.captured_s[fused.frame_ix], t0_ns=log.scene.t0_ns, max_gap_s=0.5
     )
@@ -203,7 +203,7 @@ def test_identical_units_divide_the_variance(count: int) -> None:
     masts = {f"rsu{k}": {"at": [5.0 * k, -10], "height_m": 5.0, "pem": "p"} for k in range(count)}
     plan = experiment(pems=pems, units=masts, configurations={"all": {"units": "all"}})
     log = recording([Thing("ego", "car", driving(0, 0, 5)), Thing("o", "pedestrian", driving(20, 5, 0, 1))], until_s=2)
-    fused = believed(prepare(log, plan), plan, 0)["all"].fused
+    fused = tracks_of_run(prepare(log, plan), plan, 0)["all"].fused
     np.testing.assert_allclose(fused.cov_ee_m2, variance / count)
     np.testing.assert_allclose(fused.cov_nn_m2, variance / count)
     np.testing.assert_allclose(fused.cov_en_m2, 0, atol=1e-12)
@@ -215,6 +215,6 @@ def test_no_list_before_the_first_capture_plus_latency(log: Recording, latency: 
     plan = experiment(
         pems=PEMS, units=units(None, None), configurations={"all": {"units": "all", "latency_s": latency}}
     )
-    fused = believed(prepare(log, plan), plan, 0)["all"].fused
+    fused = tracks_of_run(prepare(log, plan), plan, 0)["all"].fused
     assert fused.arrives_s[0, 0] == pytest.approx(latency)
     np.testing.assert_allclose(fused.arrives_s[0] - fused.captured_s, latency, atol=1e-9)

@@ -186,8 +186,8 @@ class TestInstalled:
     def test_interrupt(self, here: Path) -> None:
         """Ctrl-C in the middle of a replay: nothing is left, not even a temporary folder."""
         code = "import os, signal\nfrom copem_replay.perception.pem.detection import DetectionModel\n\n\n"
-        code += "class Pressed(DetectionModel):\n    def probability(self, look):\n"
-        code += "        os.kill(os.getpid(), signal.SIGINT)\n        return look.visible_share\n"
+        code += "class Pressed(DetectionModel):\n    def probability(self, view):\n"
+        code += "        os.kill(os.getpid(), signal.SIGINT)\n        return view.visible_share\n"
         (here / "keys.py").write_text(code)
         (here / "e.yaml").write_text(changed("      detection: {kind: 'keys:Pressed'}"))
 

@@ -26,9 +26,9 @@ def tool() -> ModuleType:
 
 
 def test_designs_have_the_share_that_they_claim(tool: ModuleType) -> None:
-    dice = np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     for design in tool.DESIGNS:
-        drawn = design.draw(dice, 40_000)
+        drawn = design.draw(rng, 40_000)
         assert (drawn >= 0).all()
         assert (drawn <= 1).all()
         assert drawn.mean() == pytest.approx(design.share, abs=4 * drawn.std() / 200)

@@ -17,13 +17,13 @@ import pytest
 import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.communication.link import transmit
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.file import load, parse
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import StepFusion
 from copem_replay.fusion.testing.check import check_fusion
 from copem_replay.perception.pem.detection import DetectionModel
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from tests.helpers import scenes
 from tests.helpers.scenes import experiment
@@ -115,15 +115,15 @@ def test_own_model_of_the_architecture_page_works(architecture: ModuleType) -> N
     assert isinstance(fading, type)
     assert issubclass(fading, DetectionModel)
     one = np.ones(1)
-    look = Look(one * 20, one, one, one, np.zeros(1, dtype=np.int8), one, one, one, one, one)
-    assert fading(kind="page:Fading", half_range_m=20.0).probability(look) == pytest.approx(0.5)
+    episode = ViewGeometry(one * 20, one, one, one, np.zeros(1, dtype=np.int8), one, one, one, one, one)
+    assert fading(kind="page:Fading", half_range_m=20.0).probability(episode) == pytest.approx(0.5)
 
 
 def test_own_error_model_of_the_architecture_page_works(architecture: ModuleType) -> None:
     couple = {"detection": {"kind": "page:Fading", "half_range_m": 1e9}}
     plan = experiment(pems={"sure": [couple | {"error": {"kind": "page:Widening", "sigma_m_per_m": 0.1}}]})
     log = scenes.oncoming_car()
-    fused = believed(prepare(log, plan), plan, 0)["PEM"].fused
+    fused = tracks_of_run(prepare(log, plan), plan, 0)["PEM"].fused
     rows = np.flatnonzero(fused.valid[0])
     away_m = 100.0 - 10.0 * fused.captured_s[fused.frame_ix[rows]]  # the car comes at 10 m/s along the x axis
     assert fused.cov_ee_m2 is not None

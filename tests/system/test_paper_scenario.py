@@ -34,17 +34,17 @@ def loaded(visibility: str) -> tuple[Experiment, Recording]:
 def test_the_pedestrian_comes_out_from_behind_the_truck(visibility: str) -> None:
     experiment, recording = loaded(visibility)
     ready = prepare(recording, experiment)
-    assert ready.looks.onset_s == pytest.approx([ONSET_S])
-    tracks, look = ready.measured.tracks, ready.measured.look
+    assert ready.episodes.onset_s == pytest.approx([ONSET_S])
+    tracks, episode = ready.measured.tracks, ready.measured.view
     ego = tracks.row_unit_ix == tracks.units.index("ego")
     since = np.round(tracks.row_captured_s[ego] - ONSET_S, 3)
-    share = look.visible_share[ego]
+    share = episode.visible_share[ego]
     for t, expected in SHARES.items():
         assert share[since == t] == pytest.approx(expected, abs=0.005), t
     assert share[(since >= 0) & (since <= 0.5)].max() == 0
     assert share[since > 1.1].min() == 1
     masts = ~ego & (tracks.row_captured_s >= ONSET_S) & (tracks.row_captured_s < ONSET_S + 1.9)
-    assert look.visible_share[masts].min() > 0.95, "the roadside units have a view of the crossing"
+    assert episode.visible_share[masts].min() > 0.95, "the roadside units have a view of the crossing"
 
 
 def test_times_follow_the_closed_form() -> None:

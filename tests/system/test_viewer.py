@@ -45,13 +45,13 @@ def share_of(picture: np.ndarray, colour: tuple[int, int, int]) -> float:
 def test_the_file_as_an_engineer_sees_it(made: Made, viewer: Viewer) -> None:
     viewer.open(made.path)
     assert viewer.views() >= VIEWS
-    colours = configuration_colours(made.beliefs)
+    colours = configuration_colours(made.run_tracks)
     # Three instants: before the late configuration has a list, when it has some, after the car has left.
-    for elapsed_s, believed in ((0.3, {"GT": 3, "GT late": 0}), (2.0, {"GT": 3, "GT late": 3}), (4.8, {"GT": 2})):
+    for elapsed_s, output in ((0.3, {"GT": 3, "GT late": 0}), (2.0, {"GT": 3, "GT late": 3}), (4.8, {"GT": 2})):
         viewer.seek(elapsed_s)
-        for name, count in believed.items():
+        for name, count in output.items():
             # What was computed, what is in the file, what is in the picture.
-            fused = made.beliefs[name].fused
+            fused = made.run_tracks[name].fused
             frame = np.searchsorted(fused.arrives_s[0], elapsed_s + 1e-6, side="right") - 1
             listed = np.flatnonzero((fused.frame_ix == frame) & fused.valid[0])
             assert len(listed) == count
@@ -69,7 +69,7 @@ def test_the_file_as_an_engineer_sees_it(made: Made, viewer: Viewer) -> None:
 
 def test_sent_to_a_viewer_that_runs(made: Made, viewer: Viewer, tmp_path: Path) -> None:
     check_viewer(viewer.url)
-    fewer = {name: made.beliefs[name] for name in ("GT", "PEM")}
+    fewer = {name: made.run_tracks[name] for name in ("GT", "PEM")}
     path = tmp_path / "live.rrd"
     said = write_rrd(path, made.replay, made.given, [fewer], made.table, SUMMARY, 3, viewer=viewer.url)
     assert said == []
@@ -77,13 +77,13 @@ def test_sent_to_a_viewer_that_runs(made: Made, viewer: Viewer, tmp_path: Path) 
     assert {"/world/GT/boxes", "/world/PEM/boxes", "/world/PEM/status", "/plots/gospa/PEM"} <= viewer.entities()
     assert viewer.views() & {"GT late", "pole"} == set(), "the layout that was sent, not the one before"
     assert viewer.errors() == []
-    made.write(tmp_path / "alone.rrd", beliefs=fewer)
+    made.write(tmp_path / "alone.rrd", run_tracks=fewer)
     assert rerun("rrd", "compare", "--unordered", path, tmp_path / "alone.rrd").returncode == 0
 
 
 def test_a_viewer_that_goes_leaves_the_file_complete(made: Made, tmp_path: Path) -> None:
     path, url = tmp_path / "x.rrd", f"rerun+http://127.0.0.1:{free_port()}/proxy"
-    said = write_rrd(path, made.replay, made.given, [made.beliefs], made.table, SUMMARY, 3, viewer=url)
+    said = write_rrd(path, made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3, viewer=url)
     assert said == [f"x.rrd: the viewer at {url} went before it had everything; the file is complete"]
     assert rerun("rrd", "compare", "--unordered", path, made.path).returncode == 0
 

@@ -16,7 +16,7 @@ import pytest
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording, read
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.line_of_sight import sight
@@ -88,26 +88,26 @@ def shown_in(replay: Replay, wanted: Experiment, run: int) -> tuple[pd.DataFrame
 
 def agrees(replay: Replay, wanted: Experiment, run: int, table: pd.DataFrame, shown: list[int]) -> set[int]:
     """Hold every status of one run against the table; which statuses there are."""
-    seen, beliefs, found = sight(replay, wanted, shown), believed(replay, wanted, run), set()
+    seen, run_tracks, found = sight(replay, wanted, shown), tracks_of_run(replay, wanted, run), set()
     for name in wanted.configurations:
-        of = status_of(replay, wanted, name, beliefs[name], seen, clock_of(replay.scene, table, name))
-        fused, looks = beliefs[name].fused, table[table["configuration"] == name].set_index("object_id")
+        of = status_of(replay, wanted, name, run_tracks[name], seen, clock_of(replay.scene, table, name))
+        fused, episodes = run_tracks[name].fused, table[table["configuration"] == name].set_index("object_id")
         newest = np.searchsorted(fused.arrives_s[0], of.elapsed_ns / 1e9 + 1e-6, side="right") - 1
         for m, k in enumerate(shown):
-            look = looks.loc[replay.scene.object_ids[k]]
+            episode = episodes.loc[replay.scene.object_ids[k]]
             time_s, status = of.elapsed_ns / 1e9, of.status[:, m]
             found |= set(status.tolist())
             holding = fused.frame_ix[fused.valid[0] & (fused.row_object_ix == k)]
             held = np.isin(newest, holding)
             assert ((status >= EARLY) == held).all(), "nothing is listed without being one of these"
-            if look["detected"]:
-                assert ((status == KNOWN) == (held & (time_s >= look["detection_s"] - 1e-9))).all()
-                assert (status[np.abs(time_s - look["detection_s"]) < 1e-9] == KNOWN).any()
+            if episode["detected"]:
+                assert ((status == KNOWN) == (held & (time_s >= episode["detection_s"] - 1e-9))).all()
+                assert (status[np.abs(time_s - episode["detection_s"]) < 1e-9] == KNOWN).any()
             else:
                 assert not (status == KNOWN).any()
             # What was captured since the onset is known, or waits for another, or came when all was over.
             assert wanted.measure.confirm.hits > 1 or UNCONFIRMED not in status
-            before = status[time_s < look["onset_s"] - 1e-6]
+            before = status[time_s < episode["onset_s"] - 1e-6]
             assert TOO_LATE not in before
             assert wanted.measure.count_earlier or KNOWN not in before
     return found
@@ -158,8 +158,8 @@ def test_so_do_all_views(measure: str, tmp_path: Path) -> None:
     path = tmp_path / "replay.rrd"
     six = {name: CONFIGURATIONS[name] for name in ("GT", "PEM", "late", "mixed", "gnn", "tracker")}
     given = wanted.model_copy(update={"configurations": {n: wanted.configurations[n] for n in six}})
-    beliefs = believed(replay, given, 2)
-    write_rrd(path, replay, given, [beliefs], table[table["configuration"].isin(six)], SUMMARY, 2)
+    run_tracks = tracks_of_run(replay, given, 2)
+    write_rrd(path, replay, given, [run_tracks], table[table["configuration"].isin(six)], SUMMARY, 2)
     for c, name in enumerate(six):
         mine = table[table["configuration"] == name].set_index("object_id")
         for k in shown:
@@ -182,11 +182,11 @@ def test_so_do_all_views(measure: str, tmp_path: Path) -> None:
     # A lane of its own says when the clock runs: from the onset to the end of the look.
     for k in shown:
         who = replay.scene.object_ids[k]
-        [look] = table[(table["configuration"] == "GT") & (table["object_id"] == who)].itertuples()
+        [episode] = table[(table["configuration"] == "GT") & (table["object_id"] == who)].itertuples()
         clock = lane(path, f"{who} pedestrian", len(six))
         assert clock[-2:] == [
-            (pytest.approx(look.onset_s, abs=1e-9), "since the onset"),
-            (pytest.approx(look.ended_s, abs=2e-9), "no longer looked at"),
+            (pytest.approx(episode.onset_s, abs=1e-9), "since the onset"),
+            (pytest.approx(episode.ended_s, abs=2e-9), "no longer looked at"),
         ]
 
 
@@ -199,7 +199,7 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
     replay = prepare(waiting(), wanted)
     table = replay_block(replay, wanted, np.array([0]))
     path = tmp_path / "x.rrd"
-    write_rrd(path, replay, wanted, [believed(replay, wanted, 0)], table, SUMMARY, 0)
+    write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
     assert lane(path, "2 pedestrian", 0)[:2] == [(0, "GT listed before the onset"), (1, "GT known")]
     assert lane(path, "2 pedestrian", 1) == [
         (0, "late captured"),
@@ -224,14 +224,14 @@ def test_not_confirmed_and_too_late(tmp_path: Path) -> None:
     twice = experiment(units=units, measure=PERSON | {"confirm": {"hits": 2, "of": 2}})
     replay = prepare(waiting(), twice)
     table = replay_block(replay, twice, np.array([0]))
-    write_rrd(tmp_path / "x.rrd", replay, twice, [believed(replay, twice, 0)], table, SUMMARY, 0)
+    write_rrd(tmp_path / "x.rrd", replay, twice, [tracks_of_run(replay, twice, 0)], table, SUMMARY, 0)
     assert lane(tmp_path / "x.rrd", "2 pedestrian", 1) == [(0, "PEM listed, not confirmed"), (0.1, "PEM known")]
     assert told(tmp_path / "x.rrd", "PEM", 0.0)[0] == "2 listed, not confirmed yet"
     late = experiment(units=units, measure=PERSON, configurations={"late": {"units": ["ego"], "latency_s": 1.0}})
     replay = prepare(waiting(), late)
     table = replay_block(replay, late, np.array([0]))
     assert table.set_index("object_id").loc["3", "ended_by"] == "object_left"
-    write_rrd(tmp_path / "y.rrd", replay, late, [believed(replay, late, 0)], table, SUMMARY, 0)
+    write_rrd(tmp_path / "y.rrd", replay, late, [tracks_of_run(replay, late, 0)], table, SUMMARY, 0)
     assert lane(tmp_path / "y.rrd", "3 pedestrian", 0)[2:] == [
         (2.4, "late listed too late"),
         (3.3, "late absent"),

@@ -21,11 +21,11 @@ import pytest
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import believed
+from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.rrd import telling
@@ -78,19 +78,20 @@ class Made:
     path: Path
     replay: Replay
     given: Experiment
-    beliefs: dict[str, Belief]
+    run_tracks: dict[str, FusedTracks]
     table: pd.DataFrame
 
     def write(self, path: Path, **changes: Any) -> None:
-        columns = {"replay": self.replay, "beliefs": self.beliefs, "table": self.table, "summary": SUMMARY} | changes
-        write_rrd(path, columns["replay"], self.given, [columns["beliefs"]], columns["table"], columns["summary"], 3)
+        columns = {"replay": self.replay, "run_tracks": self.run_tracks, "table": self.table}
+        columns |= {"summary": SUMMARY} | changes
+        write_rrd(path, columns["replay"], self.given, [columns["run_tracks"]], columns["table"], columns["summary"], 3)
 
 
 def make(path: Path, scene: Any, **changes: Any) -> Made:
     given = experiment(**changes)
     replay = prepare(scene, given)
-    beliefs = believed(replay, given, 3)
-    made = Made(path, replay, given, beliefs, replay_block(replay, given, np.array([3])))
+    run_tracks = tracks_of_run(replay, given, 3)
+    made = Made(path, replay, given, run_tracks, replay_block(replay, given, np.array([3])))
     made.write(path)
     return made
 
@@ -153,7 +154,7 @@ def kinds_of_boxes(path: Path) -> dict[int, Any]:
 
 @pytest.mark.parametrize("name", ["truth", *CHANGES["configurations"]])
 def test_boxes_are_those_of_the_arrays(made: Made, name: str) -> None:
-    tracks = made.replay.truth if name == "truth" else made.beliefs[name].fused
+    tracks = made.replay.truth if name == "truth" else made.run_tracks[name].fused
     entity = f"/world/{name}/boxes".replace(" ", "\\ ")
     found = rows(made.path, entity)
     assert [row[ELAPSED] for row in found] == np.rint(tracks.arrives_s[0] * 1e9).astype(int).tolist()
@@ -263,7 +264,7 @@ def test_errors_are_those_of_the_instant_a_list_is_available(made: Made) -> None
     assert (late[0][ELAPSED], late[-1][ELAPSED]) == (500_000_000, 4_000_000_000)  # at 4.5 s it has left
     once = rows(made.path, "/plots/position_error/7/PEM")
     assert [row[ELAPSED] for row in once] == [4_000_000_000]
-    fused = made.beliefs["PEM"].fused
+    fused = made.run_tracks["PEM"].fused
     [seen] = np.flatnonzero((fused.row_object_ix == 1) & fused.valid[0])
     x, y = fused.x_m[0, seen], fused.y_m[0, seen]
     assert once[0]["Scalars:scalars"] == [np.hypot(x - 60, y)]
@@ -414,8 +415,8 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
             "Legend",
         ]
     )
-    fewer = {name: made.beliefs[name] for name in ("GT", "PEM")}
-    made.write(tmp_path / "x.rrd", beliefs=fewer)
+    fewer = {name: made.run_tracks[name] for name in ("GT", "PEM")}
+    made.write(tmp_path / "x.rrd", run_tracks=fewer)
     [other] = RrdReader(tmp_path / "x.rrd").recordings()
     assert other.application_id != held.application_id
 
@@ -436,9 +437,9 @@ def test_it_is_there_whole_or_not_at_all(made: Made, tmp_path: Path, monkeypatch
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"file/x\.rrd: cannot be written: "):
         made.write(tmp_path / "file" / "x.rrd")
-    broken = {"GT": made.beliefs["GT"], "PEM": "no tracks"}
+    broken = {"GT": made.run_tracks["GT"], "PEM": "no tracks"}
     with pytest.raises(AttributeError):
-        made.write(tmp_path / "x.rrd", beliefs=broken)
+        made.write(tmp_path / "x.rrd", run_tracks=broken)
     monkeypatch.setenv("RERUN", "off")
     with pytest.raises(OutputError, match=r"x\.rrd: not written, Rerun is switched off"):
         made.write(tmp_path / "x.rrd")
@@ -480,13 +481,15 @@ def test_at_most_forty_bytes_a_box(tmp_path: Path) -> None:
         tmp_path / "x.rrd", recording(things, until_s=15.0), pems=CHANGES["pems"], configurations=names,
         units={"ego": EGO_UNIT | {"pem": "all"}, "pole": CHANGES["units"]["pole"] | {"rate_hz": None}},
     )  # fmt: skip
-    boxes = len(made.replay.truth.frame_ix) + sum(int(belief.fused.valid.sum()) for belief in made.beliefs.values())
+    boxes = len(made.replay.truth.frame_ix) + sum(
+        int(fused_tracks.fused.valid.sum()) for fused_tracks in made.run_tracks.values()
+    )
     assert boxes > 70_000
     assert made.path.stat().st_size <= 40 * boxes
 
 
 def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> None:
-    looks = pd.DataFrame(
+    episodes = pd.DataFrame(
         {
             "configuration": ["GT"] * 5 + ["x"] * 5 + ["y"] * 5,
             "object_id": ["a", "b", "c", "d", "e"] * 3,
@@ -496,13 +499,13 @@ def test_of_many_objects_those_that_tell_configurations_apart_are_shown() -> Non
         }
     )
     # Apart: a 0.2 s, b 8 s (never: 9 s); as soon as each other c after 5 s, d after 0.5 s, e never.
-    assert telling(looks, ["GT"], 1) == ["b"]
-    assert telling(looks, ["GT"], 2) == ["a", "b"]
-    assert telling(looks, ["GT"], 3) == ["a", "b", "e"]
-    assert telling(looks, ["GT"], 9) == ["a", "b", "c", "d", "e"]
-    meeting = looks.assign(conflict=looks["object_id"] == "d")
+    assert telling(episodes, ["GT"], 1) == ["b"]
+    assert telling(episodes, ["GT"], 2) == ["a", "b"]
+    assert telling(episodes, ["GT"], 3) == ["a", "b", "e"]
+    assert telling(episodes, ["GT"], 9) == ["a", "b", "c", "d", "e"]
+    meeting = episodes.assign(conflict=episodes["object_id"] == "d")
     assert telling(meeting, ["GT"], 2) == ["b", "d"]
-    assert telling(looks[looks["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], "nothing but the truth"
+    assert telling(episodes[episodes["configuration"] == "GT"], ["GT"], 2) == ["a", "b"], "nothing but the truth"
 
 
 def test_colours_do_not_repeat() -> None:

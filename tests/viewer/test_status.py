@@ -217,7 +217,7 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
     many = {f"GT{k}": {"units": "truth", "latency_s": k / 10} for k in range(8)}
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, configurations=many)
-    said = write_rrd(tmp_path / "y.rrd", made.replay, made.given, [made.beliefs], made.table, SUMMARY, 3)
+    said = write_rrd(tmp_path / "y.rrd", made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3)
     assert said == ["y.rrd: without GT6, GT7; `show: {configurations: […]}` chooses up to 6"]
     text = static(made.path, "/summary")["TextDocument:text"][0]
     assert "Not in this file: GT6, GT7." in text
@@ -281,11 +281,15 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from copem_replay.viewer.line_of_sight import sight
     from copem_replay.viewer.status import CAPTURED, KNOWN, LOST, clock_of, status_of
 
-    belief = hiding.beliefs["both"]
+    fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
-    arrives = np.where(belief.heard.captured_s < 0.45, np.inf, belief.heard.arrives_s)
-    silent = belief.fused.valid & (belief.fused.arrives_s[:, belief.fused.frame_ix] > 0.45)
-    lossy = replace(belief, heard=replace(belief.heard, arrives_s=arrives), fused=replace(belief.fused, valid=silent))
+    arrives = np.where(fused_tracks.heard.captured_s < 0.45, np.inf, fused_tracks.heard.arrives_s)
+    silent = fused_tracks.fused.valid & (fused_tracks.fused.arrives_s[:, fused_tracks.fused.frame_ix] > 0.45)
+    lossy = replace(
+        fused_tracks,
+        heard=replace(fused_tracks.heard, arrives_s=arrives),
+        fused=replace(fused_tracks.fused, valid=silent),
+    )
     seen = sight(hiding.replay, hiding.given, [hiding.replay.scene.object_number["4"]])
     clock = clock_of(hiding.replay.scene, hiding.table, "both")
     made = status_of(hiding.replay, hiding.given, "both", lossy, seen, clock)
@@ -303,16 +307,18 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     from copem_replay.viewer.line_of_sight import sight
     from copem_replay.viewer.status import LOST, UNMATCHED, VISIBLE, clock_of, status_of
 
-    belief, number = hiding.beliefs["both"], hiding.replay.scene.object_number["4"]
-    heard = belief.heard
+    fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
+    heard = fused_tracks.heard
     late = heard.captured_s[heard.frame_ix] > 0.15
     heard = replace(heard, valid=heard.valid & ~(late & (heard.row_object_ix == number)))
     if not arrives:
         heard = replace(heard, arrives_s=np.full_like(heard.arrives_s, np.inf))
-    nothing = replace(belief.fused, valid=np.zeros_like(belief.fused.valid))
+    nothing = replace(fused_tracks.fused, valid=np.zeros_like(fused_tracks.fused.valid))
     seen = sight(hiding.replay, hiding.given, [number])
     clock = clock_of(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
-    made = status_of(hiding.replay, hiding.given, "both", replace(belief, heard=heard, fused=nothing), seen, clock)
+    made = status_of(
+        hiding.replay, hiding.given, "both", replace(fused_tracks, heard=heard, fused=nothing), seen, clock
+    )
     early = made.elapsed_ns < 199_000_000
     assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}
     assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[VISIBLE]}

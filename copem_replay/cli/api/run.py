@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from copem_replay.cli.api.study import AnyExperiment, AnyPath, AnyRecordings, Study, prepared, study_of
 from copem_replay.core.errors import InputError
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
@@ -165,7 +165,7 @@ def workers(jobs: int | None) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run: int = 0) -> dict[str, Belief]:
+def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run: int = 0) -> dict[str, FusedTracks]:
     """The fused lists of each configuration in one run of one recording: the same lists that `run` measures.
 
     By the name of the configuration. `fused` holds the tracks, values (1, P) in metres, radians and m/s, and
@@ -184,7 +184,7 @@ def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run:
     if not 0 <= run < study.experiment.runs:
         raise InputError(f"run: expected 0 … {study.experiment.runs - 1}, found {run}")
     one = one_run(study.recordings[0], study.experiment, run)
-    return {name: replace(each, scene=one.replay.scene) for name, each in one.beliefs.whole().items()}
+    return {name: replace(each, scene=one.replay.scene) for name, each in one.run_tracks.whole().items()}
 
 
 def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> pd.DataFrame:
@@ -203,9 +203,9 @@ def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> p
 
     study = study_of(experiment, recording)
     replay = prepare(study.recordings[0], study.experiment)
-    found, looks = replay.measured, replay.looks
+    found, episodes = replay.measured, replay.episodes
     tracks, scene = found.tracks, replay.scene
-    onset_s = pd.Series(looks.onset_s, index=looks.object_ix).reindex(tracks.row_object_ix).to_numpy()
+    onset_s = pd.Series(episodes.onset_s, index=episodes.object_ix).reindex(tracks.row_object_ix).to_numpy()
     return pd.DataFrame(
         {
             "unit": _named(tracks.units, tracks.row_unit_ix),
@@ -213,10 +213,10 @@ def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> p
             "object_class": _named(CLASSES, scene.object_class[tracks.row_object_ix]),
             "captured_s": tracks.row_captured_s,
             "since_onset_s": tracks.row_captured_s - onset_s,
-            "range_m": found.look.range_m,
-            "azimuth_rad": found.look.azimuth_rad,
-            "bearing_rad": found.look.bearing_rad,
-            "visible_share": found.look.visible_share,
+            "range_m": found.view.range_m,
+            "azimuth_rad": found.view.azimuth_rad,
+            "bearing_rad": found.view.bearing_rad,
+            "visible_share": found.view.visible_share,
             "probability": found.probability,
         }
     )

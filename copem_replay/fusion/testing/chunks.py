@@ -1,7 +1,7 @@
-"""Stretches of the receiver's instants: a long recording is fused one after the other, and gives the lists of one go.
+"""Time chunks of the receiver's instants: a long recording is fused one after the other, and gives the lists of one go.
 
-Lists of units are numbered through the whole recording, so list f is the same in every stretch; but only those that a
-stretch needs have their entries in it.
+Lists of units are numbered through the whole recording, so list f is the same in every time chunk; but only
+those that a time chunk needs have their entries in it.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from copem_replay.communication.arrivals import Instants
-from copem_replay.core.object_list import Lists, Reports, entries_of
+from copem_replay.communication.arrivals import FusionSchedule
+from copem_replay.core.object_list import Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
 
 
-def needed_lists(captured_s: Float, at: Instants | Reports, first: int, after: int, looks_back_s: float) -> Bool:
+def needed_lists(captured_s: Float, at: FusionSchedule | Inputs, first: int, after: int, looks_back_s: float) -> Bool:
     """(F,) which lists have to have their entries at the instants `first` … `after` − 1, F lists `captured_s`.
 
     The units' newest, those that arrive, and, where `ListFusion.looks_back_s` is not 0, of those that have arrived
@@ -37,30 +37,28 @@ def needed_lists(captured_s: Float, at: Instants | Reports, first: int, after: i
     return needed
 
 
-def stretch(reports: Reports, first: int, after: int, looks_back_s: float) -> Reports:
+def chunk(inputs: Inputs, first: int, after: int, looks_back_s: float) -> Inputs:
     """The instants `first` … `after` − 1 by themselves, with the entries of the lists they need only."""
-    needed = needed_lists(reports.captured_s, reports, first, after, looks_back_s)
-    start, entries = reports.lists.start, reports.lists.entries
+    needed = needed_lists(inputs.captured_s, inputs, first, after, looks_back_s)
+    start, entries = inputs.lists.start, inputs.lists.entries
     lengths = np.where(needed, np.diff(start), 0)
     kept = np.repeat(np.tile(needed, len(start)), np.diff(start).ravel())
-    begin = reports.arrived_start[first]
+    begin = inputs.arrived_start[first]
     return replace(
-        reports,
-        lists=Lists(_start(lengths), entries[kept]),
-        issue_s=reports.issue_s[first:after],
-        newest=reports.newest[first:after],
-        arrived=reports.arrived[begin : reports.arrived_start[after]],
-        arrived_start=reports.arrived_start[first : after + 1] - begin,
+        inputs,
+        lists=ObjectLists(_start(lengths), entries[kept]),
+        issue_s=inputs.issue_s[first:after],
+        newest=inputs.newest[first:after],
+        arrived=inputs.arrived[begin : inputs.arrived_start[after]],
+        arrived_start=inputs.arrived_start[first : after + 1] - begin,
     )
 
 
-def one_after_another(stretches: Sequence[Lists]) -> Lists:
-    """The lists of all stretches, at least one, of the same runs."""
-    parts = [
-        one.entries[one.start[s, 0] : one.start[s, -1]] for s in range(len(stretches[0].start)) for one in stretches
-    ]
-    lengths = np.concatenate([np.diff(one.start) for one in stretches], axis=1)
-    return Lists(_start(lengths), np.concatenate([entries_of(0), *parts]))
+def one_after_another(chunks: Sequence[ObjectLists]) -> ObjectLists:
+    """The lists of all time chunks, at least one, of the same runs."""
+    parts = [one.entries[one.start[s, 0] : one.start[s, -1]] for s in range(len(chunks[0].start)) for one in chunks]
+    lengths = np.concatenate([np.diff(one.start) for one in chunks], axis=1)
+    return ObjectLists(_start(lengths), np.concatenate([entries_of(0), *parts]))
 
 
 def _start(lengths: Int) -> Int:

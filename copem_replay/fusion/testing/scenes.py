@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from copem_replay.core.object_list import ENTRY, Entries, Lists, Reports, entries_of
+from copem_replay.core.object_list import ENTRY, Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Tracks
-from copem_replay.fusion.inputs import reports
+from copem_replay.fusion.inputs import inputs
 
 _SCENES: tuple[tuple[str, int, int, float, int, float, float], ...] = (
     # units, objects in a square of … m, lists of each unit, up to … s late, share of lists that never arrive
@@ -38,7 +38,7 @@ class SmallScene:
     runs: Sequence[int]
     said: tuple[tuple[Entries, ...], ...]
 
-    def reports(self) -> Reports:
+    def inputs(self) -> Inputs:
         """What a fusion is told of it."""
         runs, count = len(self.said), len(self.unit_ix)
         lists = [one for run in self.said for one in run]
@@ -52,7 +52,7 @@ class SmallScene:
             self.units, np.zeros(1, dtype=np.int64), none, none, none, stamp_ns, self.captured_s, self.unit_ix,
             self.arrives_s[None], nothing.astype(bool), **dict.fromkeys(VALUES, nothing),
         )  # fmt: skip
-        return reports(heard, Lists(start, entries), max_age_s=1.0)
+        return inputs(heard, ObjectLists(start, entries), max_age_s=1.0)
 
     def of_runs(self, runs: Sequence[int]) -> SmallScene:
         """Some of its runs, in this order."""
@@ -82,11 +82,11 @@ class SmallScene:
             lambda f, one: with_columns(np.tile(one, 2), x_m=np.arange(2.0 * len(one))) if lists[f] else one
         )
 
-    def shuffled(self, dice: np.random.Generator) -> SmallScene:
+    def shuffled(self, rng: np.random.Generator) -> SmallScene:
         """With entries in another order, and tracks of units by other numbers."""
-        new = dice.permuted(np.tile(np.arange(100), (len(self.units), 1)), axis=1)
+        new = rng.permuted(np.tile(np.arange(100), (len(self.units), 1)), axis=1)
         return self._each(
-            lambda f, one: dice.permutation(with_columns(one, track_id=new[self.unit_ix[f], one["track_id"]]))
+            lambda f, one: rng.permutation(with_columns(one, track_id=new[self.unit_ix[f], one["track_id"]]))
         )
 
     def _each(self, change: Callable[[int, Entries], Entries]) -> SmallScene:
@@ -107,29 +107,29 @@ def small_scenes(seed: int) -> list[SmallScene]:
 
 
 def _scene(
-    dice: np.random.Generator, name: str, units: int, n: int, width_m: float, lists: int, late_s: float, lost: float
+    rng: np.random.Generator, name: str, units: int, n: int, width_m: float, lists: int, late_s: float, lost: float
 ) -> SmallScene:
     unit_ix = np.repeat(np.arange(units), lists)
     # Every other unit captures at the same instants.
-    phase_s = np.where(np.arange(units) % 2 == 0, 0.0, dice.uniform(0.0, 0.1, units)) * (late_s > 0)
+    phase_s = np.where(np.arange(units) % 2 == 0, 0.0, rng.uniform(0.0, 0.1, units)) * (late_s > 0)
     captured_s = np.tile(np.arange(lists) * 0.1, units) + phase_s[unit_ix]
     # Several at one instant, also of one unit; of two units never quite: the order of units is not to say who is first.
-    arrives_s = np.ceil((captured_s + dice.uniform(0.0, late_s, len(unit_ix))) / 0.05) * 0.05 + 5e-8 * unit_ix
-    arrives_s[dice.random(len(unit_ix)) < lost] = np.inf
-    place_m, speed_mps = dice.uniform(0.0, width_m, (2, n)), dice.normal(0.0, 3.0, (2, n))
-    likely = 0.8 * np.eye(len(CLASSES))[dice.integers(0, 4, n)] + 0.2 / len(CLASSES)
+    arrives_s = np.ceil((captured_s + rng.uniform(0.0, late_s, len(unit_ix))) / 0.05) * 0.05 + 5e-8 * unit_ix
+    arrives_s[rng.random(len(unit_ix)) < lost] = np.inf
+    place_m, speed_mps = rng.uniform(0.0, width_m, (2, n)), rng.normal(0.0, 3.0, (2, n))
+    likely = 0.8 * np.eye(len(CLASSES))[rng.integers(0, 4, n)] + 0.2 / len(CLASSES)
 
     def listed(f: int) -> Entries:
         one = entries_of(n)
-        one["x_m"], one["y_m"] = place_m + speed_mps * captured_s[f] + dice.normal(0.0, 0.5, (2, n))
-        one["vx_mps"], one["vy_mps"] = speed_mps + dice.normal(0.0, 0.3, (2, n))
-        one["length_m"], one["width_m"], one["height_m"] = dice.uniform(1.0, 4.0, (3, n))
+        one["x_m"], one["y_m"] = place_m + speed_mps * captured_s[f] + rng.normal(0.0, 0.5, (2, n))
+        one["vx_mps"], one["vy_mps"] = speed_mps + rng.normal(0.0, 0.3, (2, n))
+        one["length_m"], one["width_m"], one["height_m"] = rng.uniform(1.0, 4.0, (3, n))
         one["z_m"], one["yaw_rad"] = one["height_m"] / 2, np.arctan2(one["vy_mps"], one["vx_mps"])
-        one["cov_ee_m2"], one["cov_nn_m2"] = dice.uniform(0.1, 0.5, (2, n))
-        one["cov_en_m2"] = dice.uniform(-0.5, 0.5, n) * np.sqrt(one["cov_ee_m2"] * one["cov_nn_m2"])
-        one["existence"], one["track_id"] = dice.uniform(0.5, 1.0, n), np.arange(n)
+        one["cov_ee_m2"], one["cov_nn_m2"] = rng.uniform(0.1, 0.5, (2, n))
+        one["cov_en_m2"] = rng.uniform(-0.5, 0.5, n) * np.sqrt(one["cov_ee_m2"] * one["cov_nn_m2"])
+        one["existence"], one["track_id"] = rng.uniform(0.5, 1.0, n), np.arange(n)
         one["class_probability"] = likely
-        return dice.permutation(one[dice.random(n) < 0.8])
+        return rng.permutation(one[rng.random(n) < 0.8])
 
     said = tuple(tuple(listed(f) for f in range(len(unit_ix))) for _ in range(3))
     return SmallScene(name, tuple("ABCDEFGHIJKL"[:units]), unit_ix, captured_s, arrives_s, range(3), said)

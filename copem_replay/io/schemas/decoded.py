@@ -22,7 +22,7 @@ X, Y, Z, YAW, VX, VY = range(6)
 
 
 @dataclass(frozen=True)
-class Columns:
+class DecodedObjects:
     """The lists of one topic: F messages in the order read, P rows message by message, N objects.
 
     `values` are in the units and the frame of reference of `Tracks`, columns in the order of `tracks.VALUES`;

@@ -26,25 +26,25 @@ from copem_replay.io.encodings.columns import (
     rows_above,
     take_apart,
 )
-from copem_replay.io.schemas.decoded import Columns
+from copem_replay.io.schemas.decoded import DecodedObjects
 from copem_replay.io.schemas.description import Amount, Class, Description, Fields, Stamp, Yaw
 from copem_replay.io.schemas.field_paths import FieldsError, Wanted
 from copem_replay.io.schemas.lifetime import life_notes
 from copem_replay.io.schemas.shapes import largest, outlined, rounded
 from copem_replay.io.schemas.timestamps import nanoseconds
 
-__all__ = ["Class", "Description", "Fields", "FieldsError", "Listed", "Stamp", "Yaw", "listed"]
+__all__ = ["Class", "DecodedLists", "Description", "Fields", "FieldsError", "Stamp", "Yaw", "listed"]
 
 
 @dataclass(frozen=True)
-class Listed:
+class DecodedLists:
     """The lists of one topic, and what of them only recorded units need: (P,) each.
 
     `frame_code` indexes `frames`, −1: no frame is said. `covariance_m2 (P, 3)` is xx, xy, yy of the position in the
     list's frame, NaN: not said. `probability (P, C)` of each class sums to 1.
     """
 
-    columns: Columns
+    columns: DecodedObjects
     frame_code: Int
     frames: tuple[str, ...]
     existence: Float
@@ -54,7 +54,9 @@ class Listed:
     named: bool  # whether its objects have ids
 
 
-def listed(definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int) -> Listed:
+def listed(
+    definition: Definition, description: Description, payloads: Sequence[bytes], log_time_ns: Int
+) -> DecodedLists:
     """The lists that messages hold, logged at `log_time_ns (F,)`. Raises FieldsError."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is no number, or too large a one, is found out later
         return _Reader(definition, description, payloads).listed(log_time_ns)
@@ -264,7 +266,7 @@ class _Reader:
         covariance[~self._said("covariance")[keep]] = np.nan
         return covariance
 
-    def listed(self, log_time_ns: Int) -> Listed:
+    def listed(self, log_time_ns: Int) -> DecodedLists:
         """All columns of the objects that are kept. Notes stand in the order in which things are found out."""
         found, meant = self._found, self._meant()
         if lost := int((~found.decoded).sum()):
@@ -281,7 +283,7 @@ class _Reader:
         probability = self._classes()[keep]
         life = self._description.life
         gone = () if life is None else life_notes(found, life, stamp_ns, stamped)
-        columns = Columns(
+        columns = DecodedObjects(
             stamp_ns=stamp_ns[kept_message],
             stamped=stamped[kept_message],
             rows=np.bincount(message[keep], minlength=self._messages)[kept_message],
@@ -293,7 +295,7 @@ class _Reader:
             notes=(*(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()), *gone),
         )
         frame, frames = self._frame_of()
-        return Listed(
+        return DecodedLists(
             columns,
             frame[keep],
             frames,

@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, VALUES, Float
-from copem_replay.io.schemas.decoded import FARTHEST_M, Columns
+from copem_replay.io.schemas.decoded import FARTHEST_M, DecodedObjects
 
 GROUND_TRUTH = "osi3.GroundTruth"
 SENSOR_VIEW = "osi3.SensorView"
@@ -119,10 +119,10 @@ class Decoder:
         self._add_stationary(truth.stationary_object)
         self._rows.append(len(self._object_ix) - before)
 
-    def columns(self) -> Columns:
+    def columns(self) -> DecodedObjects:
         """All that was added."""
         ids, moving = self._names()
-        return Columns(
+        return DecodedObjects(
             stamp_ns=np.array(self._stamp_ns, dtype=np.int64),
             stamped=np.array(self._stamped, dtype=bool),
             rows=np.array(self._rows, dtype=np.int64),

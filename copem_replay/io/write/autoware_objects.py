@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene
 from copem_replay.io.write import cdr_writer as cdr
 from copem_replay.io.write.ros2_definitions import DETECTED_OBJECTS as SCHEMA
@@ -61,11 +61,11 @@ _EAST, _EAST_NORTH, _NORTH_EAST, _NORTH, _YAW = 0, 1, 6, 7, 35  # places in a 6 
 class DetectedObjectsWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
 
-    def __init__(self, scene: Scene, belief: Belief, frame_id: str) -> None:
-        self._fused, self._listed, self._said = belief.fused, belief.listed, belief.said
-        object_ix = belief.fused.row_object_ix
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, frame_id: str) -> None:
+        self._fused, self._listed, self._said = fused_tracks.fused, fused_tracks.listed, fused_tracks.said
+        object_ix = fused_tracks.fused.row_object_ix
         self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True)
-        self._class_ix = belief.class_of(scene)
+        self._class_ix = fused_tracks.class_of(scene)
         self.round = self._class_ix == CLASSES.index("pedestrian")
         """(P,) which objects are cylinders."""
         self._certain: list[bytes] = [_head(1.0, {int(label): 1.0}) for label in _LABEL]

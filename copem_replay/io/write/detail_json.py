@@ -17,7 +17,7 @@ import orjson
 from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Bool, Scene
 
 if TYPE_CHECKING:
-    from copem_replay.core.fused_tracks import Belief
+    from copem_replay.core.fused_tracks import FusedTracks
 
 SCHEMA = "copem_replay.ListDetail"
 Event = Mapping[str, Any]
@@ -58,11 +58,15 @@ class DetailWriter:
     """
 
     def __init__(
-        self, scene: Scene, belief: Belief, events: Mapping[int, Sequence[Event]], sizes_of: Bool | None = None
+        self,
+        scene: Scene,
+        fused_tracks: FusedTracks,
+        events: Mapping[int, Sequence[Event]],
+        sizes_of: Bool | None = None,
     ) -> None:
-        fused, heard, used = belief.fused, belief.heard, belief.used
-        self._fused, self._listed, self._events = fused, belief.listed, events
-        self._ids = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
+        fused, heard, used = fused_tracks.fused, fused_tracks.heard, fused_tracks.used
+        self._fused, self._listed, self._events = fused, fused_tracks.listed, events
+        self._ids = [fused_tracks.name_of(scene, row) for row in range(len(fused.frame_ix))]
         unsaid = [None] * len(fused.frame_ix)
         variances = (getattr(fused, name) for name in UNCERTAINTIES)
         self._variances = list(zip(*(unsaid if a is None else a[0].tolist() for a in variances), strict=True))
@@ -70,11 +74,11 @@ class DetailWriter:
         self._entries: dict[str, list[Any]] = {
             "units": [heard.units[k] for k in heard.row_unit_ix[used]],
             "captured_ns": heard.stamp_ns[heard.frame_ix[used]].tolist(),
-            "range_m": nothing if belief.look is None else belief.look.range_m[used].tolist(),
-            "visible_share": nothing if belief.look is None else belief.look.visible_share[used].tolist(),
+            "range_m": nothing if fused_tracks.view is None else fused_tracks.view.range_m[used].tolist(),
+            "visible_share": nothing if fused_tracks.view is None else fused_tracks.view.visible_share[used].tolist(),
         }
-        self._start = belief.used_start.tolist()
-        self._said = belief.said
+        self._start = fused_tracks.used_start.tolist()
+        self._said = fused_tracks.said
         self._sizes_of = np.zeros(len(fused.frame_ix), dtype=bool) if sizes_of is None else sizes_of
 
     def message(self, frame: int, available_ns: int) -> bytes:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from copem_replay.core.colours import Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Scene
 
 SCHEMA = "foxglove.SceneUpdate"
@@ -31,12 +31,14 @@ def message_class() -> Any:
 class SceneWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
 
-    def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb, frame_id: str = FRAME_ID) -> None:
-        fused = belief.fused
-        self._listed = belief.listed
+    def __init__(
+        self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str = FRAME_ID
+    ) -> None:
+        fused = fused_tracks.fused
+        self._listed = fused_tracks.listed
         # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
-        names = [belief.name_of(scene, row) for row in range(len(fused.frame_ix))]
-        kinds = belief.class_of(scene).tolist()
+        names = [fused_tracks.name_of(scene, row) for row in range(len(fused.frame_ix))]
+        kinds = fused_tracks.class_of(scene).tolist()
         made = {
             key: _prototype(key[0], metadata(*key, configuration), colour, frame_id)
             for key in dict.fromkeys(zip(names, kinds, strict=True))

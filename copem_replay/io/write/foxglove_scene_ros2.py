@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from copem_replay.core.colours import Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Scene
 from copem_replay.io.write import cdr_writer as cdr
 from copem_replay.io.write.foxglove_scene import ALPHA, metadata
@@ -24,10 +24,10 @@ _CUBE = np.dtype([("pose", "<f8", 7), ("size", "<f8", 3), ("color", "<f8", 4), (
 class SceneWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, list by list."""
 
-    def __init__(self, scene: Scene, belief: Belief, configuration: str, colour: Rgb, frame_id: str) -> None:
-        self._fused, self._listed = belief.fused, belief.listed
-        names = [belief.name_of(scene, row) for row in range(len(belief.fused.frame_ix))]
-        kinds = belief.class_of(scene).tolist()
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str) -> None:
+        self._fused, self._listed = fused_tracks.fused, fused_tracks.listed
+        names = [fused_tracks.name_of(scene, row) for row in range(len(fused_tracks.fused.frame_ix))]
+        kinds = fused_tracks.class_of(scene).tolist()
         made = {
             key: _entity(key[0], metadata(*key, configuration), frame_id)
             for key in dict.fromkeys(zip(names, kinds, strict=True))

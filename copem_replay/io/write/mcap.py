@@ -1,6 +1,6 @@
-"""MCAP out: the input's channels with their messages untouched, and what each configuration believed.
+"""MCAP out: the input's channels with their messages untouched, and each configuration's fused lists.
 
-For each configuration three channels: `copem/<configuration>/objects` (what was believed), `…/scene` (the same as
+For each configuration three channels: `copem/<configuration>/objects` (the fused lists), `…/scene` (the same as
 boxes) and `…/detail` (JSON: what the objects cannot carry), in messages of the input's family
 (`io/write/message_family.py`), one per fused list, log_time = publish_time = the instant it was available. The same
 input gives the same bytes; the file appears under its name when it is complete, or not at all.
@@ -22,7 +22,7 @@ from mcap.writer import Writer
 
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.files import atomic_file
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_NS, Scene, Tracks
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
@@ -42,7 +42,7 @@ def write_mcap(
     path: Path,
     source: Path,
     scene: Scene,
-    beliefs: Iterable[Mapping[str, Belief]],
+    run_tracks: Iterable[Mapping[str, FusedTracks]],
     table: pd.DataFrame,
     manifest: Mapping[str, str],
     family: Family | None = None,
@@ -50,7 +50,7 @@ def write_mcap(
 ) -> list[str]:
     """Write `source` with the fused lists of one run added.
 
-    `beliefs`: one time chunk after the other, by configuration; values (1, P).
+    `run_tracks`: one time chunk after the other, by configuration; values (1, P).
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
@@ -62,10 +62,10 @@ def write_mcap(
     """
     original = source_of(source, window)
     family = family or Osi()
-    rest = iter(beliefs)
+    rest = iter(run_tracks)
     first = next(rest)  # it tells the configurations and the units
     colours = configuration_colours(first)
-    units = dict.fromkeys(unit for belief in first.values() for unit in belief.heard.units)
+    units = dict.fromkeys(unit for fused_tracks in first.values() for unit in fused_tracks.heard.units)
     numbers = {unit: k + 1 for k, unit in enumerate(units)}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)
@@ -73,7 +73,7 @@ def write_mcap(
         messages = original.messages(original.register(catalogue, without=ours))
         opened = family.open(catalogue, scene, numbers)
 
-        def lists_of(chunk: Mapping[str, Belief]) -> list[Iterator[Message]]:
+        def lists_of(chunk: Mapping[str, FusedTracks]) -> list[Iterator[Message]]:
             return list(_lists_of(opened, scene, chunk, table, colours))
 
         begun = lists_of(first)  # registers the channels
@@ -100,12 +100,12 @@ def _add_records(writer: Writer, original: Source, family: Family, manifest: Map
 
 
 def _lists_of(
-    opened: Opened, scene: Scene, chunk: Mapping[str, Belief], table: pd.DataFrame, colours: Mapping[str, Rgb]
+    opened: Opened, scene: Scene, chunk: Mapping[str, FusedTracks], table: pd.DataFrame, colours: Mapping[str, Rgb]
 ) -> Iterator[Iterator[Message]]:
     """Of each configuration the messages of one time chunk."""
-    for name, belief in chunk.items():
-        events = _events(belief.fused, table[table["configuration"] == name])
-        yield _lists(scene, belief.fused, opened.channels(name, belief, events, colours[name]))
+    for name, fused_tracks in chunk.items():
+        events = _events(fused_tracks.fused, table[table["configuration"] == name])
+        yield _lists(scene, fused_tracks.fused, opened.channels(name, fused_tracks, events, colours[name]))
 
 
 def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from typing import Any, Protocol
 
 from copem_replay.core.colours import Rgb
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Scene
 from copem_replay.io.recording import Recording
 from copem_replay.io.write import (
@@ -58,7 +58,7 @@ class Opened(Protocol):
     """A family whose schemas are in the file that is being written."""
 
     def channels(
-        self, name: str, belief: Belief, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
         """The channels of a configuration: `objects`, `scene`, `detail`, in this order."""
 
@@ -111,7 +111,7 @@ class _OpenedOsi:
         self._details = catalogue.schema(detail.SCHEMA, "jsonschema", json.dumps(detail.JSON_SCHEMA).encode())
 
     def channels(
-        self, name: str, belief: Belief, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
         description = {
             f"{OSI_CHANNEL}description": f"fused object list of configuration {name}",
@@ -122,12 +122,12 @@ class _OpenedOsi:
         channel, scene = self._catalogue.channel, self._scene
         return {
             channel(objects, "protobuf", self._objects, description): sensor_data.SensorDataWriter(
-                scene, belief, self._units
+                scene, fused_tracks, self._units
             ),
             channel(scenes, "protobuf", self._scenes, {}): foxglove.SceneWriter(
-                scene, belief, name, colour, self._frame_id
+                scene, fused_tracks, name, colour, self._frame_id
             ),
-            channel(details, "json", self._details, {}): detail.DetailWriter(scene, belief, events),
+            channel(details, "json", self._details, {}): detail.DetailWriter(scene, fused_tracks, events),
         }
 
 
@@ -155,14 +155,14 @@ class _OpenedRos2:
         ]
 
     def channels(
-        self, name: str, belief: Belief, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
+        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
         scene, frame_id = self._scene, self._frame_id
-        objects = detected_objects.DetectedObjectsWriter(scene, belief, frame_id)
-        details = detail.DetailWriter(scene, belief, events, sizes_of=objects.round)
+        objects = detected_objects.DetectedObjectsWriter(scene, fused_tracks, frame_id)
+        details = detail.DetailWriter(scene, fused_tracks, events, sizes_of=objects.round)
         writers: list[ListWriter] = [
             objects,
-            foxglove_ros2.SceneWriter(scene, belief, name, colour, frame_id),
+            foxglove_ros2.SceneWriter(scene, fused_tracks, name, colour, frame_id),
             _AsString(details),
         ]
         numbers = [

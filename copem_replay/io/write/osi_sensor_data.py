@@ -15,7 +15,7 @@ import numpy as np
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, VALUES, Float, Scene
 
 if TYPE_CHECKING:
-    from copem_replay.core.fused_tracks import Belief
+    from copem_replay.core.fused_tracks import FusedTracks
 
 SCHEMA = "osi3.SensorData"
 OSI_VERSION = (3, 8, 0)
@@ -60,10 +60,10 @@ class SensorDataWriter:
     `unit_numbers` are the numbers by which `sensor_id` names the units that contributed.
     """
 
-    def __init__(self, scene: Scene, belief: Belief, unit_numbers: Mapping[str, int]) -> None:
-        fused = belief.fused
-        self._fused, self._listed = fused, belief.listed
-        object_ix, said = fused.row_object_ix, belief.said
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, unit_numbers: Mapping[str, int]) -> None:
+        fused = fused_tracks.fused
+        self._fused, self._listed = fused, fused_tracks.listed
+        object_ix, said = fused.row_object_ix, fused_tracks.said
         self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True).tolist()
         # What is the same in every list of an object is set once, on a prototype: setting fields is what costs.
         if said is None:
@@ -74,12 +74,12 @@ class SensorDataWriter:
         self._values = list(zip(*(getattr(fused, name)[0].tolist() for name in VALUES), strict=True))
         spread = ("cov_ee_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
         self._sigma = list(zip(*(_sigma(getattr(fused, name), len(fused.frame_ix)) for name in spread), strict=True))
-        heard = belief.heard
+        heard = fused_tracks.heard
         numbers = np.array([unit_numbers[name] for name in heard.units])
         if said is None:
-            self._unit = numbers[heard.row_unit_ix[belief.used]].tolist()
-            self._captured_ns = heard.stamp_ns[heard.frame_ix[belief.used]].tolist()
-            self._used_start = belief.used_start.tolist()
+            self._unit = numbers[heard.row_unit_ix[fused_tracks.used]].tolist()
+            self._captured_ns = heard.stamp_ns[heard.frame_ix[fused_tracks.used]].tolist()
+            self._used_start = fused_tracks.used_start.tolist()
         else:  # of what contributed, only the first unit and the newest capture are said
             known = said["unit_ix"] >= 0
             self._unit = numbers[said["unit_ix"][known]].tolist()

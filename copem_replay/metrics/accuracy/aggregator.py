@@ -1,4 +1,4 @@
-"""Assess: the statistics of `metrics/accuracy/statistics.py`, added up stretch of lists after stretch."""
+"""Assess: the statistics of `metrics/accuracy/statistics.py`, added up chunk after chunk of lists."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.object_list import Lists
+from copem_replay.core.object_list import ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Scene, Tracks
 from copem_replay.metrics.accuracy.kernel import Asked, Found, SoFar, Stays, Sums, World, add_up, close
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, EXISTENCE_BINS, OBJECT, RUN, Accuracy, Settings
@@ -14,25 +14,25 @@ from copem_replay.metrics.matching import Matches
 from copem_replay.metrics.reference import Reference
 
 if TYPE_CHECKING:
-    from copem_replay.metrics.episodes import Looks
+    from copem_replay.metrics.episodes import Episodes
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
-class Assessment:
+class Aggregator:
     """Adds up how far off K lists in S runs are, as many of them at a time as one likes: to the last bit the same.
 
     `issue_s (K,)`: when each list of all is available, ascending. `stay_from_s (M,)`: the first instant that object
     and ego share, or earlier. `reference`: from where distances are measured, at the instants of all lists.
     `measured_class (C,)`: what a ghost has to be called to count as one of a measured object. `runs`: S, the same in
-    every stretch (1, too, where one run stands for all).
+    every time chunk (1, too, where one run stands for all).
     """
 
     def __init__(
         self,
         issue_s: Float,
         scene: Scene,
-        looks: Looks,
+        episodes: Episodes,
         stay_from_s: Float,
         reference: Reference,
         measured_class: Bool,
@@ -41,10 +41,10 @@ class Assessment:
         runs: int,
     ) -> None:
         first = np.searchsorted(issue_s, stay_from_s - _TOLERANCE_S, side="left")
-        count = np.maximum(np.searchsorted(issue_s, looks.ended_s + _TOLERANCE_S, side="right") - first, 0)
-        look_of = np.full(len(scene.object_ids), -1)
-        look_of[looks.object_ix] = np.arange(len(looks.object_ix))
-        self._stays = Stays(look_of, first, count, np.cumsum(count) - count, looks.onset_s, looks.ended_s)
+        count = np.maximum(np.searchsorted(issue_s, episodes.ended_s + _TOLERANCE_S, side="right") - first, 0)
+        episode_of = np.full(len(scene.object_ids), -1)
+        episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
+        self._stays = Stays(episode_of, first, count, np.cumsum(count) - count, episodes.onset_s, episodes.ended_s)
         self._issue_s, self._reference, self._settings = issue_s, reference, settings
         distance_edges_m, time_edges_s = _column(settings.distance_edges_m), _column(settings.time_edges_s)
         thresholds = _column(settings.existence_thresholds)
@@ -52,7 +52,7 @@ class Assessment:
             settings.cutoff_m, settings.power, settings.gate_m, measured_class, distance_edges_m, time_edges_s,
             thresholds,
         )  # fmt: skip
-        S, M, L = runs, len(looks.object_ix), int(count.sum())
+        S, M, L = runs, len(episodes.object_ix), int(count.sum())
         self._out = Sums(
             np.full((S, L), np.nan, dtype=np.float32),
             np.full((S, L), np.nan, dtype=np.float32),
@@ -65,10 +65,10 @@ class Assessment:
         )
         self._out.by_run["lists"] = reference.present.sum()
         self._out.by_run["time_s"] = _time_s(issue_s, reference.present)
-        self._so_far = SoFar(np.full((S, M), -1), np.tile(looks.onset_s, (S, 1)))
+        self._so_far = SoFar(np.full((S, M), -1), np.tile(episodes.onset_s, (S, 1)))
         self._added = 0
 
-    def add(self, lists: Lists, about: Matches, now: Matches, world: Tracks) -> None:
+    def add(self, lists: ObjectLists, about: Matches, now: Matches, world: Tracks) -> None:
         """Add the lists that come next.
 
         `about`: matches at the instants the entries tell of, `now`: at those the lists are available. `world`: the

@@ -40,9 +40,9 @@ class Found(NamedTuple):
 
 
 class Stays(NamedTuple):
-    """Which lists count for each look. All (M,) but the first."""
+    """Which lists count for each episode. All (M,) but the first."""
 
-    look_of: Int  # (N,) by object, −1: not measured
+    episode_of: Int  # (N,) by object, −1: not measured
     first_list: Int  # lists first_list … first_list + lists − 1
     lists: Int
     column: Int  # of the first one in the arrays list by list
@@ -84,25 +84,25 @@ class SoFar(NamedTuple):
 
 class _Here(NamedTuple):
     # The objects whose stay has the list at hand, and their matches in the run at hand.
-    look: Int
+    episode: Int
     row: Int  # of the truth, −1: it has a gap there
     distance_band: Int
     pair: Int  # the entry that is about it, −1: none
     match: Int  # the one that is matched with it now, −1: none
     target: Int  # its place among the targets, −1: not looked at now
-    place_of: Int  # by look: its place here, −1: not here
+    place_of: Int  # by episode: its place here, −1: not here
 
 
 class _Targets(NamedTuple):
     # Those of them that are looked at now: the truth of GOSPA.
-    look: Int
+    episode: Int
     x_m: Float
     y_m: Float
     partner: Int
-    false: Int  # believed objects without a partner that are nearest to it
+    false: Int  # estimates without a partner that are nearest to it
 
 
-class _Believed(NamedTuple):
+class _Estimates(NamedTuple):
     # The entries of the list at hand that GOSPA counts.
     x_m: Float
     y_m: Float
@@ -130,12 +130,12 @@ def add_up(
     targets = _Targets(
         np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64), np.empty(M, np.int64)
     )  # fmt: skip
-    believed = _Believed(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
+    estimates = _Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
     for k in range(len(issue_s)):
         if not present[k]:
             continue
         from_m = (reference_x_m[k], reference_y_m[k])
-        n, looked_at = _gather(k, issue_s[k], world, stays, from_m, asked, here, targets)
+        n, wanted = _gather(k, issue_s[k], world, stays, from_m, asked, here, targets)
         time_band = _band(asked.time_edges_s, issue_s[k])
         column = stays.column + (k - stays.first_list)
         for s in range(S):
@@ -143,10 +143,10 @@ def add_up(
             here.match[:n] = -1
             count = _entries(
                 s, start[s, k], start[s, k + 1], entries, about, now, stays, from_m, time_band, asked,
-                here, targets, looked_at, believed, out,
+                here, targets, wanted, estimates, out,
             )  # fmt: skip
             for h in range(n):
-                m, match = here.look[h], here.match[h]
+                m, match = here.episode[h], here.match[h]
                 if here.target[h] >= 0:
                     _look(out.by_object[s], m, match)
                     _look(out.by_distance[s], here.distance_band[h], match)
@@ -173,14 +173,14 @@ def add_up(
                 _add_pair(out.by_object[s], m, east_m, north_m, of, mean)
                 _add_pair(out.by_distance[s], here.distance_band[h], east_m, north_m, of, mean)
                 _add_pair(out.by_time[s], time_band, east_m, north_m, of, mean)
-            _gospa(out.gospa[s], column, out.by_object[s], out.by_run[s], targets, looked_at, believed, count, asked)
+            _gospa(out.gospa[s], column, out.by_object[s], out.by_run[s], targets, wanted, estimates, count, asked)
         for h in range(n):
-            here.place_of[here.look[h]] = -1
+            here.place_of[here.episode[h]] = -1
 
 
 @nb.njit(cache=True, nogil=True)
 def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
-    """Add what ends with the looks, after all lists."""
+    """Add what ends with the episodes, after all lists."""
     S, M = out.by_object.shape
     for s in range(S):
         for m in range(M):
@@ -195,41 +195,41 @@ def _gather(
     targets: _Targets,
 ) -> tuple[int, int]:  # fmt: skip
     # How many objects are in their stay at list k, last those in a gap of the truth; and how many are looked at.
-    n = looked_at = 0
+    n = wanted = 0
     for p in range(world.start[k], world.start[k + 1]):
-        m = stays.look_of[world.object_ix[p]]
+        m = stays.episode_of[world.object_ix[p]]
         if m < 0 or k < stays.first_list[m] or k >= stays.first_list[m] + stays.lists[m]:
             continue
         away_m = np.hypot(world.x_m[p] - from_m[0], world.y_m[p] - from_m[1])
-        here.look[n], here.row[n], here.place_of[m] = m, p, n
+        here.episode[n], here.row[n], here.place_of[m] = m, p, n
         here.distance_band[n], here.target[n] = _band(asked.distance_edges_m, away_m), -1
         if issue_s >= stays.onset_s[m] - _TOLERANCE_S:
-            here.target[n] = looked_at
-            targets.look[looked_at], targets.x_m[looked_at], targets.y_m[looked_at] = m, world.x_m[p], world.y_m[p]
-            looked_at += 1
+            here.target[n] = wanted
+            targets.episode[wanted], targets.x_m[wanted], targets.y_m[wanted] = m, world.x_m[p], world.y_m[p]
+            wanted += 1
         n += 1
     for m in range(len(stays.lists)):
         if here.place_of[m] < 0 and stays.first_list[m] <= k < stays.first_list[m] + stays.lists[m]:
-            here.look[n], here.row[n], here.place_of[m] = m, -1, n
+            here.episode[n], here.row[n], here.place_of[m] = m, -1, n
             here.distance_band[n] = here.target[n] = -1
             n += 1
-    return n, looked_at
+    return n, wanted
 
 
 @nb.njit(cache=True, nogil=True)
 def _entries(
     s: int, first: int, after: int, entries: Entries, about: Found, now: Found, stays: Stays,
-    from_m: tuple[float, float], time_band: int, asked: Asked, here: _Here, targets: _Targets, looked_at: int,
-    believed: _Believed, out: Sums,
+    from_m: tuple[float, float], time_band: int, asked: Asked, here: _Here, targets: _Targets, wanted: int,
+    estimates: _Estimates, out: Sums,
 ) -> int:  # fmt: skip
     # Find the matches in a list of run s, count its other entries, and say how many GOSPA counts.
     count = 0
     for i in range(first, after):
         if about.role[i] == MATCH:
-            m = stays.look_of[about.object_ix[i]]
+            m = stays.episode_of[about.object_ix[i]]
             if m >= 0 and here.place_of[m] >= 0:
                 here.pair[here.place_of[m]] = i
-        m = stays.look_of[now.object_ix[i]] if now.role[i] != GHOST else -1
+        m = stays.episode_of[now.object_ix[i]] if now.role[i] != GHOST else -1
         h = here.place_of[m] if m >= 0 else -1
         target = here.target[h] if h >= 0 else -1
         if now.role[i] == MATCH and h >= 0:
@@ -240,7 +240,7 @@ def _entries(
                 out.by_object[s, m].duplicates += 1
         measured = asked.measured_class[about.class_ix[i]]
         if target >= 0 or (now.role[i] == GHOST and measured):
-            believed.x_m[count], believed.y_m[count] = entries[i].x_m, entries[i].y_m
+            estimates.x_m[count], estimates.y_m[count] = entries[i].x_m, entries[i].y_m
             count += 1
         if measured:
             existence = entries[i].existence
@@ -252,7 +252,7 @@ def _entries(
             if now.role[i] == GHOST:
                 stale = about.role[i] != GHOST
                 _ghost(
-                    s, entries[i].x_m, entries[i].y_m, existence, stale, from_m, time_band, asked, targets, looked_at,
+                    s, entries[i].x_m, entries[i].y_m, existence, stale, from_m, time_band, asked, targets, wanted,
                     out,
                 )  # fmt: skip
     return count
@@ -261,7 +261,7 @@ def _entries(
 @nb.njit(cache=True, nogil=True)
 def _ghost(
     s: int, x_m: float, y_m: float, existence: float, stale: bool, from_m: tuple[float, float], time_band: int,
-    asked: Asked, targets: _Targets, looked_at: int, out: Sums,
+    asked: Asked, targets: _Targets, wanted: int, out: Sums,
 ) -> None:  # fmt: skip
     out.by_run[s].ghosts += 1
     if stale:
@@ -274,9 +274,9 @@ def _ghost(
         out.by_distance[s, distance_band].ghosts += 1
     if time_band >= 0:
         out.by_time[s, time_band].ghosts += 1
-    nearest = _nearest(x_m, y_m, targets, looked_at)
+    nearest = _nearest(x_m, y_m, targets, wanted)
     if nearest >= 0:
-        out.by_object[s, targets.look[nearest]].ghosts += 1
+        out.by_object[s, targets.episode[nearest]].ghosts += 1
 
 
 @nb.njit(cache=True, nogil=True)
@@ -340,33 +340,33 @@ def _add_pair(records: Records, at: int, east_m: float, north_m: float, of: floa
 
 @nb.njit(cache=True, nogil=True)
 def _gospa(
-    gospa: NDArray[np.float32], column: Int, by_object: Records, sums: Any, targets: _Targets, looked_at: int,
-    believed: _Believed, count: int, asked: Asked,
+    gospa: NDArray[np.float32], column: Int, by_object: Records, sums: Any, targets: _Targets, wanted: int,
+    estimates: _Estimates, count: int, asked: Asked,
 ) -> None:  # fmt: skip
     # One list's GOSPA, handed out to the objects, and its OSPA: the same pairs are the best ones for both.
-    if looked_at == 0:
+    if wanted == 0:
         return
     sums.lists_looked += 1
     unit = asked.cutoff_m**asked.power
     localisation, pairs = gospa_pairs(
-        targets.x_m[:looked_at], targets.y_m[:looked_at], believed.x_m[:count], believed.y_m[:count],
-        asked.cutoff_m, asked.power, targets.partner[:looked_at],
+        targets.x_m[:wanted], targets.y_m[:wanted], estimates.x_m[:count], estimates.y_m[:count],
+        asked.cutoff_m, asked.power, targets.partner[:wanted],
     )  # fmt: skip
-    most = max(looked_at, count)
+    most = max(wanted, count)
     sums.ospa_m += ((localisation + unit * (most - pairs)) / most) ** (1.0 / asked.power)
-    believed.paired[:count] = False
-    targets.false[:looked_at] = 0
-    for t in range(looked_at):
+    estimates.paired[:count] = False
+    targets.false[:wanted] = 0
+    for t in range(wanted):
         if targets.partner[t] >= 0:
-            believed.paired[targets.partner[t]] = True
+            estimates.paired[targets.partner[t]] = True
     for b in range(count):
-        if not believed.paired[b]:
-            targets.false[_nearest(believed.x_m[b], believed.y_m[b], targets, looked_at)] += 1
-    for t in range(looked_at):
-        m, b = targets.look[t], targets.partner[t]
+        if not estimates.paired[b]:
+            targets.false[_nearest(estimates.x_m[b], estimates.y_m[b], targets, wanted)] += 1
+    for t in range(wanted):
+        m, b = targets.episode[t], targets.partner[t]
         located = missed = 0.0
         if b >= 0:
-            square = (targets.x_m[t] - believed.x_m[b]) ** 2 + (targets.y_m[t] - believed.y_m[b]) ** 2
+            square = (targets.x_m[t] - estimates.x_m[b]) ** 2 + (targets.y_m[t] - estimates.y_m[b]) ** 2
             located = square ** (asked.power / 2)
         else:
             missed = unit / 2
@@ -378,10 +378,10 @@ def _gospa(
 
 
 @nb.njit(cache=True, nogil=True)
-def _nearest(x_m: float, y_m: float, targets: _Targets, looked_at: int) -> int:
+def _nearest(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
     # The target nearest to a place, of equally near ones the first; −1: there are none.
     best, least = -1, np.inf
-    for t in range(looked_at):
+    for t in range(wanted):
         square = (targets.x_m[t] - x_m) ** 2 + (targets.y_m[t] - y_m) ** 2
         if square < least:
             best, least = t, square

@@ -27,42 +27,42 @@ def _root(mean: float | None, power: float = 2.0) -> float | None:
 
 def position_rmse_m(of: Total) -> float | None:
     """Against the truth when the list is available."""
-    return _root(_ratio(of.looks["square_m2"], of.looks["placed"]))
+    return _root(_ratio(of.episodes["square_m2"], of.episodes["placed"]))
 
 
 def position_rmse_captured_m(of: Total) -> float | None:
     """Against the truth at the instant the entry tells of."""
-    return _root(_ratio(of.looks["square_then_m2"], of.looks["pairs"]))
+    return _root(_ratio(of.episodes["square_then_m2"], of.episodes["pairs"]))
 
 
 def velocity_rmse_mps(of: Total) -> float | None:
     """Against the truth when the list is available."""
-    return _root(_ratio(of.looks["velocity_square_m2ps2"], of.looks["placed"]))
+    return _root(_ratio(of.episodes["velocity_square_m2ps2"], of.episodes["placed"]))
 
 
 def bias_east_m(of: Total) -> float | None:
     """Mean error, entry minus truth when the list is available."""
-    return _ratio(of.looks["east_m"], of.looks["placed"])
+    return _ratio(of.episodes["east_m"], of.episodes["placed"])
 
 
 def bias_north_m(of: Total) -> float | None:
     """Mean error, entry minus truth when the list is available."""
-    return _ratio(of.looks["north_m"], of.looks["placed"])
+    return _ratio(of.episodes["north_m"], of.episodes["placed"])
 
 
 def age_of_information_s(of: Total) -> float | None:
     """Mean over pairs."""
-    return _ratio(of.looks["age_of_information_s"], of.looks["pairs"])
+    return _ratio(of.episodes["age_of_information_s"], of.episodes["pairs"])
 
 
 def nees(of: Total) -> float | None:
     """Mean over pairs; `nees_expected` is right."""
-    return _ratio(of.looks["nees"], of.looks["pairs"])
+    return _ratio(of.episodes["nees"], of.episodes["pairs"])
 
 
 def nees_expected(of: Total) -> float | None:
     """What it is on average where covariances are true: 2, less what the gate cuts off."""
-    return _ratio(of.looks["nees_expected"], of.looks["pairs"])
+    return _ratio(of.episodes["nees_expected"], of.episodes["pairs"])
 
 
 def nees_low(of: Total) -> float | None:
@@ -79,7 +79,7 @@ def _limit(of: Total, level: float) -> float | None:
     """Of the gamma distribution that has the mean and the variance of that mean of samples, as far as the gate lets."""
     from scipy.special import gammaincinv
 
-    mean, square = nees_expected(of), _ratio(of.looks["nees_square_expected"], of.looks["pairs"])
+    mean, square = nees_expected(of), _ratio(of.episodes["nees_square_expected"], of.episodes["pairs"])
     if mean is None or square is None:
         return None
     shape = of.matched_rows * mean**2 / (square - mean**2)
@@ -88,17 +88,17 @@ def _limit(of: Total, level: float) -> float | None:
 
 def beyond_gate_share(of: Total) -> float | None:
     """Of errors as the covariances of pairs have them, how many the gate lets not through; mean over pairs."""
-    return _ratio(of.looks["beyond_gate"], of.looks["pairs"])
+    return _ratio(of.episodes["beyond_gate"], of.episodes["pairs"])
 
 
 def identity_switches(of: Total) -> float | None:
-    """Mean over looks and runs that have a match with a track."""
-    return _ratio(of.looks["switches"], of.tracked_rows)
+    """Mean over episodes and runs that have a match with a track."""
+    return _ratio(of.episodes["switches"], of.tracked_rows)
 
 
 def longest_gap_s(of: Total) -> float | None:
-    """Mean over looks and runs."""
-    return _ratio(of.looks["longest_gap_s"], of.rows)
+    """Mean over episodes and runs."""
+    return _ratio(of.episodes["longest_gap_s"], of.rows)
 
 
 def _gospa(of: Total, sums: float) -> float | None:
@@ -107,23 +107,23 @@ def _gospa(of: Total, sums: float) -> float | None:
 
 def gospa_m(of: Total) -> float | None:
     """Mean over lists of GOSPAᵖ, to the power 1/p: the p-th powers of its three parts add up to its own."""
-    parts = sum(of.looks[f"gospa_{part}"] for part in ("localisation", "missed", "false"))
+    parts = sum(of.episodes[f"gospa_{part}"] for part in ("localisation", "missed", "false"))
     return _gospa(of, parts)
 
 
 def gospa_localisation_m(of: Total) -> float | None:
     """The part of the pairs."""
-    return _gospa(of, of.looks["gospa_localisation"])
+    return _gospa(of, of.episodes["gospa_localisation"])
 
 
 def gospa_missed_m(of: Total) -> float | None:
     """The part of the misses."""
-    return _gospa(of, of.looks["gospa_missed"])
+    return _gospa(of, of.episodes["gospa_missed"])
 
 
 def gospa_false_m(of: Total) -> float | None:
     """The part of the false entries."""
-    return _gospa(of, of.looks["gospa_false"])
+    return _gospa(of, of.episodes["gospa_false"])
 
 
 def ospa_m(of: Total) -> float | None:

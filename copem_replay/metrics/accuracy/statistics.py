@@ -2,8 +2,8 @@
 
 All is counted once per fused list, at the instant it is available, in the lists at which there is a place to measure
 distances from (the ego). Nothing is held from one list to the next, nothing weighed by time. What a *match* is, a
-*duplicate*, a *ghost*: `metrics/matching.py`. A look's *stay*: the lists from the first instant that object and ego
-share to the end of the look, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
+*duplicate*, a *ghost*: `metrics/matching.py`. An episode's *stay*: the lists from the first instant that object and ego
+share to the end of the episode, but where the truth has a gap. *Looked at*: those of its stay from the onset on.
 
 What is said of an object is asked at the instant the entry *tells of*; what the list is worth *now* at the instant it
 is available. So there are matches of two kinds, by the same rules: *pairs* are entries that are about an object then.
@@ -22,11 +22,11 @@ in the mean of others:
   many independent samples as run × object pairs with a match, for lists are not independent.
 - identity switches (1): pairs of another track than the object's last pair that named a track.
 
-Over a look, by what is matched now; never matched: the worst there is:
+Over an episode, by what is matched now; never matched: the worst there is:
 
 - longest time unknown (MTL, s): from onset to end it is known from a list with a match to the next list without one.
   The last list of the stay before the onset says whether it was known at the onset; before the first list it is
-  unknown. Never matched: the whole look.
+  unknown. Never matched: the whole episode.
 - missed (1): lists looked at that hold no match. Duplicates (1): in lists looked at.
 
 Over all lists:
@@ -94,7 +94,7 @@ OBJECT = np.dtype(
         ("gospa_false", "f8"),
     ]
 )
-"""The same of one look, and further sums (`longest_gap_s`: the longest)."""
+"""The same of one episode, and further sums (`longest_gap_s`: the longest)."""
 
 RUN = np.dtype(
     [
@@ -135,7 +135,7 @@ class Accuracy:
     settings: Settings
     first_list: Int  # (M,) of the stay: its lists are first_list … first_list + count − 1
     count: Int  # (M,)
-    error_m: NDArray[np.float32]  # (S, L) look after look, L = Σ count: position error; NaN: no placed pair
+    error_m: NDArray[np.float32]  # (S, L) episode after episode, L = Σ count: position error; NaN: no placed pair
     gospa: NDArray[np.float32]  # (S, L) the object's part of GOSPAᵖ; NaN: not looked at
     by_object: Records  # (S, M) of OBJECT
     by_run: Records  # (S,) of RUN
@@ -165,13 +165,13 @@ def for_runs(of: Accuracy, runs: int) -> Accuracy:
 
 @dataclass(frozen=True)
 class Total:
-    """What figures are made of: sums over runs, looks and, added, logs."""
+    """What figures are made of: sums over runs, episodes and, added, logs."""
 
     settings: Settings
-    rows: int  # looks × runs
+    rows: int  # episodes × runs
     matched_rows: int  # with a pair at least
     tracked_rows: int  # with a pair at least whose entry names a track
-    looks: Any  # one OBJECT
+    episodes: Any  # one OBJECT
     runs: Any  # one RUN
     ghosts_at: Int  # (T,)
     by_distance: Records  # (bands,) of BAND
@@ -190,18 +190,18 @@ class Total:
 
 
 def total(parts: Sequence[Accuracy]) -> Total:
-    """Sums over all runs, in their order, and looks; of blocks of runs the same as of all at once, to the last bit."""
+    """Sums over all runs, in their order, and episodes; blocks of runs add up to the same, to the last bit."""
 
     def all_runs(name: str) -> Any:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    looks = np.concatenate([part.by_object.reshape(-1) for part in parts])
+    episodes = np.concatenate([part.by_object.reshape(-1) for part in parts])
     return Total(
         parts[0].settings,
-        len(looks),
-        int((looks["pairs"] > 0).sum()),
-        int((looks["tracked"] > 0).sum()),
-        _summed(looks),
+        len(episodes),
+        int((episodes["pairs"] > 0).sum()),
+        int((episodes["tracked"] > 0).sum()),
+        _summed(episodes),
         _summed(all_runs("by_run")),
         all_runs("ghosts_at").sum(axis=0),
         *(_summed(all_runs(name)) for name in ("by_distance", "by_time", "by_existence")),

@@ -37,7 +37,7 @@ class Course:
     until_s: float
 
 
-class EgoCourse:
+class EgoPath:
     """The ego's path through the log, and how it drives along it.
 
     `path (V, 4)`: arc length, x, y, yaw; `size_m (2,)`. `frame_s`, `frame_m`, `frame_mps (F,)`: when, how far along the

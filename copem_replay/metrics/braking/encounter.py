@@ -14,9 +14,9 @@ import numpy as np
 from copem_replay.core.box_distance import nearest
 from copem_replay.core.tracks import Float, Int, Scene, Tracks
 from copem_replay.metrics.braking.blocked import blocked
-from copem_replay.metrics.braking.ego_path import Course, EgoCourse
+from copem_replay.metrics.braking.ego_path import Course, EgoPath
 from copem_replay.metrics.config import MetricsSetup
-from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.episodes import Episodes
 
 NODE_S = 0.01
 """Between instants of judgement (chosen: at 10 m/s² a straight line over it is off by 0.13 mm)."""
@@ -29,7 +29,7 @@ _STRETCHES = 3
 class Encounter:
     """One measured object and the ego, from the onset until the object leaves. V vertices of the ego's path."""
 
-    look_ix: int
+    episode_ix: int
     time_s: Float  # (T,)
     course: Course
     path: Float  # (V, 4): arc length, x, y, yaw
@@ -40,12 +40,12 @@ class Encounter:
     spent_s: float  # when the ego that does not brake first comes within the margin
 
 
-def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: MetricsSetup) -> tuple[Encounter, ...]:
-    """The encounters in conflict, in the order of the looks. None without `braking`."""
+def encounters(scene: Scene, truth: Tracks, found: Episodes, experiment: MetricsSetup) -> tuple[Encounter, ...]:
+    """The encounters in conflict, in the order of the episodes. None without `braking`."""
     braking = experiment.braking
     if braking is None or scene.ego_ix < 0:
         return ()
-    ego = EgoCourse(scene, truth, experiment.max_gap_s)
+    ego = EgoPath(scene, truth, experiment.max_gap_s)
     result = []
     track_of = {int(object_ix): track for track, object_ix in enumerate(truth.object_ix)}
     for k, object_ix in enumerate(found.object_ix):
@@ -60,7 +60,7 @@ def encounters(scene: Scene, truth: Tracks, found: Looks, experiment: MetricsSet
 
 
 def _may_meet(
-    ego: EgoCourse, truth: Tracks, rows: Int, onset_s: float, constant_from_s: float | None, margin_m: float
+    ego: EgoPath, truth: Tracks, rows: Int, onset_s: float, constant_from_s: float | None, margin_m: float
 ) -> bool:
     """Whether an object comes anywhere near the ego's course: what surely stays away needs no closer look.
 
@@ -89,10 +89,10 @@ def _ahead(path: Float, along_m: Float) -> tuple[Float, Float]:
 
 
 def _encounter(
-    ego: EgoCourse, truth: Tracks, rows: Int, look_ix: int, onset_s: float, constant_from_s: float | None,
+    ego: EgoPath, truth: Tracks, rows: Int, episode_ix: int, onset_s: float, constant_from_s: float | None,
     margin_m: float,
 ) -> Encounter | None:  # fmt: skip
-    """The encounter of one look, None where the ego, not braking, stays clear."""
+    """The encounter of one episode, None where the ego, not braking, stays clear."""
     own_s = truth.row_captured_s[rows]
     last_s = max(float(own_s[-1]), onset_s)
     regular = onset_s + NODE_S * np.arange(int((last_s - onset_s) / NODE_S) + 1)
@@ -110,7 +110,7 @@ def _encounter(
     blocked(ego.path, ego.size_m, other, other_size, margin_m, float(course.bound_m[0]), course.bound_m, stretch_m)
     within = ((course.along_m >= stretch_m[:, 0]) & (course.along_m <= stretch_m[:, 1])).any(axis=0)
     spent_s = time_s[np.argmax(within)] if within.any() else np.inf
-    return Encounter(look_ix, time_s, course, ego.path, ego.size_m, other, other_size, stretch_m, float(spent_s))
+    return Encounter(episode_ix, time_s, course, ego.path, ego.size_m, other, other_size, stretch_m, float(spent_s))
 
 
 def _unwrapped(yaw_rad: Float) -> Float:

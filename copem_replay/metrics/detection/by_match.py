@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.object_list import Entries, Lists
+from copem_replay.core.object_list import Entries, ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_match_kernel import HELD, Matched, Stays, levels
@@ -24,12 +24,12 @@ from copem_replay.metrics.detection.by_truth_id import Detections, capture_insta
 from copem_replay.metrics.matching import Matches
 
 if TYPE_CHECKING:
-    from copem_replay.metrics.episodes import Looks
+    from copem_replay.metrics.episodes import Episodes
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 _FOUND = np.dtype(
     [
-        ("run_ix", "i8"), ("look_ix", "i8"), ("existence", "f8"), ("detection_s", "f8"), ("captured_s", "f8"),
+        ("run_ix", "i8"), ("episode_ix", "i8"), ("existence", "f8"), ("detection_s", "f8"), ("captured_s", "f8"),
         ("unit_ix", "i8"),
     ]
 )  # fmt: skip
@@ -38,14 +38,14 @@ _FOUND = np.dtype(
 
 @dataclass(frozen=True)
 class Steps:
-    """When each look would be detected if only entries of at least some existence were listed. All (R,).
+    """When each episode would be detected if only entries of at least some existence were listed. All (R,).
 
-    By run, look and time. Of one run and look existence and time both ascend, from the detection itself on: the first
-    row with as much existence as is asked for says when; where none has, it is never detected.
+    By run, episode and time. Of one run and episode existence and time both ascend, from the detection itself on: the
+    first row with as much existence as is asked for says when; where none has, it is never detected.
     """
 
     run_ix: Int
-    look_ix: Int
+    episode_ix: Int
     existence: Float
     detection_s: Float
 
@@ -68,18 +68,20 @@ def captures_of(heard: Tracks) -> Captures:
 
 
 class FirstMatches:
-    """First detection of each of M looks in S runs, of as many lists at a time as one likes.
+    """First detection of each of M episodes in S runs, of as many lists at a time as one likes.
 
-    `captures`: what entries go back to, those of all lists. What is remembered from one stretch of lists to the next
+    `captures`: what entries go back to, those of all lists. What is remembered from one time chunk of lists to the next
     is, beside what has been found, which captures hold an object more surely than it is known to be there.
     """
 
-    def __init__(self, looks: Looks, *, runs: int, confirm: Confirm, count_earlier: bool, captures: Captures) -> None:
-        count = len(looks.object_ix)
-        look_of = np.full(int(looks.object_ix.max(initial=-1)) + 1, -1)
-        look_of[looks.object_ix] = np.arange(count)
-        not_before_s = np.full(count, -np.inf) if count_earlier else looks.onset_s - _TOLERANCE_S
-        self._stays = Stays(look_of, not_before_s, looks.ended_s + _TOLERANCE_S)
+    def __init__(
+        self, episodes: Episodes, *, runs: int, confirm: Confirm, count_earlier: bool, captures: Captures
+    ) -> None:
+        count = len(episodes.object_ix)
+        episode_of = np.full(int(episodes.object_ix.max(initial=-1)) + 1, -1)
+        episode_of[episodes.object_ix] = np.arange(count)
+        not_before_s = np.full(count, -np.inf) if count_earlier else episodes.onset_s - _TOLERANCE_S
+        self._stays = Stays(episode_of, not_before_s, episodes.ended_s + _TOLERANCE_S)
         self._confirm, self._captures = confirm, captures
         # Captures are numbered: the instants, which are nobody's, then the lists, each its unit's.
         self._instants = int(captures.instant.max(initial=-1)) + 1
@@ -88,7 +90,7 @@ class FirstMatches:
         self._held = np.empty(0, dtype=HELD)
         self._found: list[Entries] = [np.empty(0, dtype=_FOUND)]
 
-    def add(self, lists: Lists, matches: Matches, issue_s: Float) -> None:
+    def add(self, lists: ObjectLists, matches: Matches, issue_s: Float) -> None:
         """Take in the lists that come next. `issue_s (K,)`: when each is available, ascending."""
         # One hit confirms at once, whatever the captures.
         source = np.zeros((0, 2), dtype=np.int64)
@@ -104,7 +106,7 @@ class FirstMatches:
         # Of empty lists, which begin where the next does, the last is the one that holds the entry.
         run_ix, number = np.divmod(np.searchsorted(lists.start.ravel(), entry, side="right") - 1, lists.start.shape[1])
         found = np.empty(len(entry), dtype=_FOUND)
-        found["run_ix"], found["look_ix"] = run_ix, self._stays.look_of[matches.object_ix[entry]]
+        found["run_ix"], found["episode_ix"] = run_ix, self._stays.episode_of[matches.object_ix[entry]]
         found["existence"], found["detection_s"] = level[entry], issue_s[number]
         found["captured_s"], found["unit_ix"] = lists.entries["captured_s"][entry], lists.entries["unit_ix"][entry]
         self._found.append(found)
@@ -115,17 +117,17 @@ class FirstMatches:
         The captured instant and the first unit are those of the entry.
         """
         found = np.concatenate(self._found)
-        # As they were found: each look's in order of time.
-        found = found[np.lexsort((found["look_ix"], found["run_ix"]))]
-        run_ix, look_ix = found["run_ix"], found["look_ix"]
-        first = (np.diff(run_ix, prepend=-1) != 0) | (np.diff(look_ix, prepend=-1) != 0)
+        # As they were found: each episode's in order of time.
+        found = found[np.lexsort((found["episode_ix"], found["run_ix"]))]
+        run_ix, episode_ix = found["run_ix"], found["episode_ix"]
+        first = (np.diff(run_ix, prepend=-1) != 0) | (np.diff(episode_ix, prepend=-1) != 0)
         shape = self._best.shape
         detections = Detections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
-        at = run_ix[first], look_ix[first]
+        at = run_ix[first], episode_ix[first]
         detections.detection_s[at] = found["detection_s"][first]
         detections.captured_s[at] = found["captured_s"][first]
         detections.first_unit_ix[at] = found["unit_ix"][first]
-        columns = (run_ix, look_ix, found["existence"], found["detection_s"])
+        columns = (run_ix, episode_ix, found["existence"], found["detection_s"])
         return detections, Steps(*map(np.ascontiguousarray, columns))
 
 

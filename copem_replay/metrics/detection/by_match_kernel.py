@@ -1,4 +1,4 @@
-"""The compiled kernel of `metrics/detection/by_match.py`: at which existence each object is known, look by look."""
+"""The compiled kernel of `metrics/detection/by_match.py`: the existence at which each object is known, by episode."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.matching import DUPLICATE, MATCH
 
-HELD = np.dtype([("run_ix", "i8"), ("look_ix", "i8"), ("capture", "i8"), ("existence", "f8")])
-"""With which existence, the highest there was, a capture holds the object of a look."""
+HELD = np.dtype([("run_ix", "i8"), ("episode_ix", "i8"), ("capture", "i8"), ("existence", "f8")])
+"""With which existence, the highest there was, a capture holds the object of an episode."""
 
 
 class Matched(NamedTuple):
-    """Lists of S runs and what their entries are about, as `Lists` and `Matches`. `issue_s (K,)`: when available."""
+    """Lists of S runs and their matches, as `ObjectLists` and `Matches`. `issue_s (K,)`: when available."""
 
     start: Int  # (S, K + 1)
     entries: Entries  # (N,)
@@ -29,7 +29,7 @@ class Matched(NamedTuple):
 class Stays(NamedTuple):
     """Looks by object, −1: none, and from which capture until which list each counts."""
 
-    look_of: Int  # (C,)
+    episode_of: Int  # (C,)
     not_before_s: Float  # (M,)
     until_s: Float  # (M,)
 
@@ -41,9 +41,9 @@ def levels(
 ) -> NDArray[Any]:  # fmt: skip
     """At each entry that makes an object known at a higher existence than before: that existence, in `level (N,)`.
 
-    `source (N, 2)`: captures an entry goes back to, −1: none; `group` says of each capture whose it is, (captures,).
-    Carried over: `best (S, M)`, the existence at which each is known; `held`, by run and look, which is given back as
-    it is after these lists. A capture that holds an object no more surely than it is known makes it no surer: whatever
+    `source (N, 2)`: captures an entry goes back to, −1: none; `group (captures,)`: whose capture each is.
+    Carried over: `best (S, M)`, the existence at which each is known; `held`, by run and episode, given back as it
+    is after these lists. A capture that holds an object no more surely than it is known makes it no surer: whatever
     it would confirm, the same number of hits has confirmed already.
     """
     start, entries, role = lists.start, lists.entries, lists.role
@@ -51,17 +51,17 @@ def levels(
     most = 0
     for s in range(S):
         most = max(most, start[s, -1] - start[s, 0])
-    look, first = np.empty(most, np.int64), np.empty(M + 1, np.int64)
+    episode, first = np.empty(most, np.int64), np.empty(M + 1, np.int64)
     row, number = np.empty(most, np.int64), np.empty(most, np.int64)
-    holds = np.full(len(group) if hits > 1 else 0, -np.inf)  # by capture, of the look at hand
+    holds = np.full(len(group) if hits > 1 else 0, -np.inf)  # by capture, of the episode at hand
     used = np.empty(len(held) + 2 * most if hits > 1 else 0, np.int64)
     within = np.empty(of)
     left, kept, h = np.empty(len(held), HELD), 0, 0
     for s in range(S):
-        _by_look(s, lists, stays, look, first, row, number)
+        _by_episode(s, lists, stays, episode, first, row, number)
         for m in range(M):
             n = 0
-            while h < len(held) and held[h].run_ix == s and held[h].look_ix == m:
+            while h < len(held) and held[h].run_ix == s and held[h].episode_ix == m:
                 used[n] = held[h].capture
                 holds[used[n]] = held[h].existence
                 n += 1
@@ -96,25 +96,25 @@ def levels(
             for c in used[:n]:
                 if holds[c] > best[s, m]:
                     one = left[kept]
-                    one.run_ix, one.look_ix, one.capture, one.existence = s, m, c, holds[c]
+                    one.run_ix, one.episode_ix, one.capture, one.existence = s, m, c, holds[c]
                     kept += 1
                 holds[c] = -np.inf
     return left[:kept].copy()
 
 
 @nb.njit(cache=True, nogil=True)
-def _by_look(s: int, lists: Matched, stays: Stays, look: Int, first: Int, row: Int, number: Int) -> None:
-    # The entries of run s that count, look by look and in each list by list: `row`, and `number` of its list.
+def _by_episode(s: int, lists: Matched, stays: Stays, episode: Int, first: Int, row: Int, number: Int) -> None:
+    # The entries of run s that count, episode by episode and in each list by list: `row`, and `number` of its list.
     start, entries, object_ix, role, issue_s = lists.start[s], lists.entries, lists.object_ix, lists.role, lists.issue_s
-    look_of, not_before_s, until_s = stays.look_of, stays.not_before_s, stays.until_s
+    episode_of, not_before_s, until_s = stays.episode_of, stays.not_before_s, stays.until_s
     first[:] = 0
     for k in range(len(issue_s)):
         for i in range(start[k], start[k + 1]):
             about = role[i] == MATCH or role[i] == DUPLICATE
-            m = look_of[object_ix[i]] if about and object_ix[i] < len(look_of) else -1
+            m = episode_of[object_ix[i]] if about and object_ix[i] < len(episode_of) else -1
             if m >= 0 and (issue_s[k] > until_s[m] or entries[i].captured_s < not_before_s[m]):
                 m = -1
-            look[i - start[0]] = m
+            episode[i - start[0]] = m
             if m >= 0:
                 first[m] += 1
     n = 0
@@ -122,7 +122,7 @@ def _by_look(s: int, lists: Matched, stays: Stays, look: Int, first: Int, row: I
         n, first[m] = n + first[m], n
     for k in range(len(issue_s)):
         for i in range(start[k], start[k + 1]):
-            m = look[i - start[0]]
+            m = episode[i - start[0]]
             if m >= 0:
                 row[first[m]], number[first[m]] = i, k
                 first[m] += 1

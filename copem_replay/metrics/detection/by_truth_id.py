@@ -16,31 +16,31 @@ from typing import TYPE_CHECKING, NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.communication.arrivals import outrun
+from copem_replay.communication.arrivals import out_of_sequence
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
 
 if TYPE_CHECKING:
-    from copem_replay.metrics.episodes import Looks
+    from copem_replay.metrics.episodes import Episodes
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
 class Detections:
-    """When each look of Looks ended in a detection, run by run. All (S, M), NaN and −1 where not detected."""
+    """When each episode of Episodes ended in a detection, run by run. All (S, M), NaN and −1 where not detected."""
 
     detection_s: Float
     captured_s: Float
     first_unit_ix: Int
 
 
-def detect(heard: Tracks, found: Looks, *, confirm: Confirm, count_earlier: bool, max_age_s: float) -> Detections:
-    """First detection of every look, from the lists of all units heard (their arrival times are common to all runs).
+def detect(heard: Tracks, found: Episodes, *, confirm: Confirm, count_earlier: bool, max_age_s: float) -> Detections:
+    """First detection of every episode, from the lists of all units heard (their arrival times are common to all runs).
 
     `max_age_s` counts from capture, on top of a list's own way to the receiver.
     """
-    heard = replace(heard, arrives_s=np.where(outrun(heard), np.inf, heard.arrives_s))
+    heard = replace(heard, arrives_s=np.where(out_of_sequence(heard), np.inf, heard.arrives_s))
     arrives_s = heard.arrives_s[0, heard.frame_ix]
     captured_s = heard.row_captured_s
     order, bounds = _by_object(heard, found, arrives_s)
@@ -86,18 +86,18 @@ def shortest_period_s(heard: Tracks) -> float:
     return min(periods, default=0.0)
 
 
-def _by_object(heard: Tracks, found: Looks, arrives_s: Float) -> tuple[Int, Int]:
-    """Rows of each look in order of arrival, then of the units: (rows,), and where each look's begin (M + 1,)."""
+def _by_object(heard: Tracks, found: Episodes, arrives_s: Float) -> tuple[Int, Int]:
+    """Rows of each episode in order of arrival, then of the units: (rows,), and where each episode's begin (M + 1,)."""
     # One place more than there are objects: index −1, no truth id, is looked at by nobody.
-    look_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
-    look_of[found.object_ix] = np.arange(len(found.object_ix))
-    look = look_of[heard.row_object_ix]
-    rows = np.flatnonzero((look >= 0) & np.isfinite(arrives_s))
+    episode_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
+    episode_of[found.object_ix] = np.arange(len(found.object_ix))
+    episode = episode_of[heard.row_object_ix]
+    rows = np.flatnonzero((episode >= 0) & np.isfinite(arrives_s))
     # Arrivals within a microsecond are one instant: among them the experiment's order of units decides.
     ordered = np.unique(arrives_s[rows])
     instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > _TOLERANCE_S)[np.searchsorted(ordered, arrives_s[rows])]
-    rows = rows[np.lexsort((heard.row_unit_ix[rows], instant, look[rows]))]
-    return rows, np.searchsorted(look[rows], np.arange(len(found.object_ix) + 1))
+    rows = rows[np.lexsort((heard.row_unit_ix[rows], instant, episode[rows]))]
+    return rows, np.searchsorted(episode[rows], np.arange(len(found.object_ix) + 1))
 
 
 def _superseded_s(heard: Tracks) -> Float:
@@ -151,7 +151,7 @@ def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, o
     detection_s, newest_s, first_unit_ix = out
     held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
     nobody = np.zeros(len(frame_unit_ix), dtype=np.int64)
-    # Which instants hold the object; a token per look and run spares clearing them.
+    # Which instants hold the object; a token per episode and run spares clearing them.
     by_instant, by_list = nobody.copy(), nobody.copy()
     token = 0
     for m in range(len(bounds) - 1):

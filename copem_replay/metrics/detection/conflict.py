@@ -1,4 +1,4 @@
-"""Foresee: when does what the receiver believes imply a collision? (The paper's detection of the potential collision.)
+"""When do the receiver's fused tracks imply a collision? (The paper's detection of the potential collision.)
 
 A fused list implies one when the object, keeping its perceived velocity from its perceived place, will within the
 horizon be in the ego's corridor: what the ego, at its present speed, will sweep of its own path, and a margin around
@@ -13,11 +13,11 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.box_distance import pose_on
-from copem_replay.core.fused_tracks import Belief
+from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
-from copem_replay.metrics.braking.ego_path import EgoCourse
+from copem_replay.metrics.braking.ego_path import EgoPath
 from copem_replay.metrics.config import Confirm, Conflict
-from copem_replay.metrics.episodes import Looks
+from copem_replay.metrics.episodes import Episodes
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 _PIECE_M = 2.0
@@ -26,30 +26,30 @@ _PIECES = 500
 """More pieces than this are not made: they are longer then (chosen: a kilometre)."""
 
 
-class Foreseeing:
-    """When the receiver first has a list (`hits` of its last `of` lists) that implies a collision, look by look.
+class ConflictDetector:
+    """When the receiver first has a list (`hits` of its last `of` lists) that implies a collision, episode by episode.
 
     As with detections, a list counts when something at or after the onset contributed to what it says of the object.
-    Stretches of a log are added one after the other.
+    Time chunks of a log are added one after the other.
     """
 
-    def __init__(self, ego: EgoCourse, found: Looks, wanted: Conflict, *, confirm: Confirm, count_earlier: bool):
+    def __init__(self, ego: EgoPath, found: Episodes, wanted: Conflict, *, confirm: Confirm, count_earlier: bool):
         self._ego, self._found, self._wanted, self._confirm = ego, found, wanted, confirm
         never = np.full(len(found.object_ix), -np.inf)
         self._not_before_s = never if count_earlier else found.onset_s - _TOLERANCE_S
         self._lists, self._runs, self._issue_s = 0, 1, [np.empty(0)]
-        self._held: dict[tuple[int, int], list[Int]] = {}  # by run and look: lists that imply one
+        self._held: dict[tuple[int, int], list[Int]] = {}  # by run and episode: lists that imply one
 
-    def add(self, belief: Belief, first_run: int = 0) -> None:
-        """Take in what is believed in runs (S,), `first_run` and those that follow; several of one stretch may be."""
-        fused = belief.fused
+    def add(self, fused_tracks: FusedTracks, first_run: int = 0) -> None:
+        """Take in the fused tracks of runs (S,), `first_run` and on; several of one time chunk may be."""
+        fused = fused_tracks.fused
         self._runs = max(self._runs, first_run + len(fused.valid))
         issue_s = fused.arrives_s[0]
         pieces, bounds = corridors(self._ego, issue_s, self._wanted)
         implied = np.zeros(fused.valid.shape, dtype=np.bool_)
         boxes = _Boxes(fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
         _implied(fused.valid, boxes, fused.frame_ix, pieces, bounds, self._wanted.horizon_s, implied)
-        newest_s = belief.captured_s
+        newest_s = fused_tracks.captured_s
         track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
         for m, object_ix in enumerate(self._found.object_ix.tolist()):
             if object_ix not in track_of:
@@ -63,7 +63,7 @@ class Foreseeing:
                 self._held.setdefault((first_run + s, m), []).append(held)
 
     def next(self, issue_s: Float) -> None:
-        """Done with a stretch, whose lists were available at `issue_s (K,)`."""
+        """Done with a time chunk, whose lists were available at `issue_s (K,)`."""
         self._issue_s.append(issue_s)
         self._lists += len(issue_s)
 
@@ -81,7 +81,7 @@ class Foreseeing:
         return first_s
 
 
-def corridors(ego: EgoCourse, now_s: Float, wanted: Conflict) -> tuple[Float, Int]:
+def corridors(ego: EgoPath, now_s: Float, wanted: Conflict) -> tuple[Float, Int]:
     """Rectangles (C, 5) — x, y, yaw, length, width — that cover the ego's corridor at instants (K,), grouped (K + 1,).
 
     None where the ego is not in the log.

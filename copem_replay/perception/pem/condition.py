@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from copem_replay.core.components import Frozen, NotNegative, Number, Share, Slot
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, class_indices
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.pem.detection import DETECTION_MODELS, DetectionModel
 from copem_replay.perception.pem.error import ERROR_MODELS, ErrorModel
 
@@ -49,21 +49,21 @@ class Condition(Frozen):
     classes: ClassNames | None = None
     visible_share: Annotated[tuple[Share, Share], AfterValidator(_ascending)] | None = None
 
-    def holds(self, look: Look) -> Bool:
+    def holds(self, view: ViewGeometry) -> Bool:
         """(P,) where the condition holds."""
-        result = np.ones(len(look.range_m), dtype=bool)
+        result = np.ones(len(view.range_m), dtype=bool)
         if self.range_m is not None:
-            result &= _within(look.range_m, *self.range_m)
+            result &= _within(view.range_m, *self.range_m)
         if self.azimuth_deg is not None:
             first, last = np.deg2rad(self.azimuth_deg)
             if last - first < 2 * np.pi - _ON_THE_BOUND:  # [150, −150] runs through 180
                 span = np.mod(last - first, 2 * np.pi)
-                turned = np.mod(look.azimuth_rad - first + _ON_THE_BOUND, 2 * np.pi)
+                turned = np.mod(view.azimuth_rad - first + _ON_THE_BOUND, 2 * np.pi)
                 result &= turned <= span + 2 * _ON_THE_BOUND
         if self.classes is not None:
-            result &= np.isin(look.class_ix, class_indices(self.classes))
+            result &= np.isin(view.class_ix, class_indices(self.classes))
         if self.visible_share is not None:
-            result &= _within(look.visible_share, *self.visible_share)
+            result &= _within(view.visible_share, *self.visible_share)
         return result
 
 
@@ -87,9 +87,9 @@ class Couple(Frozen):
 Pem = Annotated[tuple[Couple, ...], Field(min_length=1)]
 
 
-def applies(pem: tuple[Couple, ...], look: Look) -> Int:
+def applies(pem: tuple[Couple, ...], view: ViewGeometry) -> Int:
     """(P,) index of the couple that applies to each row, −1 where none does (then it is not detected)."""
-    chosen = np.full(len(look.range_m), -1)
+    chosen = np.full(len(view.range_m), -1)
     for k, couple in enumerate(pem):
-        chosen[(chosen < 0) & couple.when.holds(look)] = k
+        chosen[(chosen < 0) & couple.when.holds(view)] = k
     return chosen

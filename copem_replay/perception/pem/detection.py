@@ -11,34 +11,34 @@ from pydantic import Field, model_validator
 
 from copem_replay.core.components import Component, NotNegative, Share, asked, wrong
 from copem_replay.core.tracks import Float
-from copem_replay.core.view_geometry import Look
+from copem_replay.core.view_geometry import ViewGeometry
 
 
 class DetectionModel(Component, ABC):
     """Base of detection models.
 
     >>> class Fading(cr.DetectionModel):
-    ...     def probability(self, look):
-    ...         return look.visible_share * np.exp2(-look.range_m / 50.0)
+    ...     def probability(self, view):
+    ...         return view.visible_share * np.exp2(-view.range_m / 50.0)
     >>> view = cr.ViewGeometry(*np.full((10, 1), 1.0))
     >>> Fading(kind="my_package.models:Fading").probability(view).round(3)
     array([0.986])
     """
 
     @abstractmethod
-    def probability(self, look: Look) -> Float:
+    def probability(self, view: ViewGeometry) -> Float:
         """(P,) probability that each row is listed, 0 … 1."""
 
 
-def probability_of(model: DetectionModel, look: Look, where: str) -> Float:
+def probability_of(model: DetectionModel, view: ViewGeometry, where: str) -> Float:
     """(P,) what a model says, checked. Raises InputError, naming `where` it stands, when it is no probability."""
-    found = asked(model, where, lambda: np.asarray(model.probability(look), dtype=float))
-    expected = (len(look.range_m),)
+    found = asked(model, where, lambda: np.asarray(model.probability(view), dtype=float))
+    expected = (len(view.range_m),)
     if found.shape != expected:
-        raise wrong(model, where, f"probability(look): expected shape {expected}, found {found.shape}", "probability")
+        raise wrong(model, where, f"probability(view): expected shape {expected}, found {found.shape}", "probability")
     beyond = ~((found >= 0) & (found <= 1 + 1e-12))
     if beyond.any():
-        raise wrong(model, where, f"probability(look): expected 0 … 1, found {found[beyond][0]}", "probability")
+        raise wrong(model, where, f"probability(view): expected 0 … 1, found {found[beyond][0]}", "probability")
     return found
 
 
@@ -47,9 +47,9 @@ class VisibleShare(DetectionModel):
 
     kind: Literal["visible_share"] = "visible_share"
 
-    def probability(self, look: Look) -> Float:
+    def probability(self, view: ViewGeometry) -> Float:
         """(P,) the visible share itself."""
-        return look.visible_share
+        return view.visible_share
 
 
 class Constant(DetectionModel):
@@ -58,9 +58,9 @@ class Constant(DetectionModel):
     kind: Literal["constant"] = "constant"
     probability_: Annotated[Share, Field(alias="probability")]
 
-    def probability(self, look: Look) -> Float:
+    def probability(self, view: ViewGeometry) -> Float:
         """(P,) all the same."""
-        return np.full(len(look.range_m), self.probability_)
+        return np.full(len(view.range_m), self.probability_)
 
 
 class Table(DetectionModel):
@@ -89,11 +89,11 @@ class Table(DetectionModel):
             )
         return self
 
-    def probability(self, look: Look) -> Float:
+    def probability(self, view: ViewGeometry) -> Float:
         """(P,) interpolated."""
         table = np.array(self.probability_)
-        i, a = _place(np.array(self.range_m), look.range_m)
-        j, b = _place(np.array(self.visible_share), look.visible_share)
+        i, a = _place(np.array(self.range_m), view.range_m)
+        j, b = _place(np.array(self.visible_share), view.visible_share)
         i1, j1 = np.minimum(i + 1, table.shape[0] - 1), np.minimum(j + 1, table.shape[1] - 1)
         low = table[i, j] * (1 - b) + table[i, j1] * b
         high = table[i1, j] * (1 - b) + table[i1, j1] * b

@@ -10,15 +10,15 @@ import numpy as np
 
 from copem_replay.core.components import Component, Covariance, NotNegative, Pair, asked, wrong
 from copem_replay.core.tracks import Float
-from copem_replay.core.view_geometry import Errors, Look, Noise
+from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 
 
 class ErrorModel(Component, ABC):
     """Base of error models.
 
     >>> class Widening(cr.ErrorModel):
-    ...     def perturb(self, look, noise):
-    ...         sigma_m = 0.01 * look.range_m
+    ...     def perturb(self, view, noise):
+    ...         sigma_m = 0.01 * view.range_m
     ...         east_m, north_m = sigma_m * noise("east"), sigma_m * noise("north")
     ...         return cr.Errors(east_m, north_m, sigma_m**2, 0 * sigma_m, sigma_m**2)
     >>> view = cr.ViewGeometry(*np.full((10, 1), 20.0))
@@ -27,10 +27,10 @@ class ErrorModel(Component, ABC):
     """
 
     @abstractmethod
-    def perturb(self, look: Look, noise: Noise) -> Errors:
+    def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
         """Errors of every candidate row in every run, and how uncertain the unit says its entries are.
 
-        `look` has P rows, one per object and list. `noise(name)` gives (S, P) standard normals, a row of them per run:
+        `view` has P rows, one per object and list. `noise(name)` gives (S, P) standard normals, a row of them per run:
         one name for each independent quantity, the same numbers whenever it is asked for. No other source of chance.
 
         Returns `Errors`, all finite:
@@ -47,12 +47,12 @@ class ErrorModel(Component, ABC):
         """
 
 
-def errors_of(model: ErrorModel, look: Look, noise: Noise, runs: int, where: str) -> Errors:
+def errors_of(model: ErrorModel, view: ViewGeometry, noise: Noise, runs: int, where: str) -> Errors:
     """What a model says, checked. Raises InputError, naming `where` it stands, when shapes or numbers are wrong."""
-    found = asked(model, where, lambda: model.perturb(look, noise))
+    found = asked(model, where, lambda: model.perturb(view, noise))
     if not isinstance(found, Errors):
-        raise wrong(model, where, f"perturb(look, noise): expected Errors, found {type(found).__name__}", "perturb")
-    n = len(look.range_m)
+        raise wrong(model, where, f"perturb(view, noise): expected Errors, found {type(found).__name__}", "perturb")
+    n = len(view.range_m)
     for field in fields(found):
         values = getattr(found, field.name)
         if values is None:
@@ -83,7 +83,7 @@ class Gaussian(ErrorModel):
     size_sigma_m: NotNegative = 0.0
     speed_sigma_mps: NotNegative = 0.0
 
-    def perturb(self, look: Look, noise: Noise) -> Errors:
+    def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
         """Offsets = mean + L·z with L·Lᵀ the covariance, turned into easting and northing."""
         (a, b), (_, d) = self.covariance_m2
         l11 = np.sqrt(a)
@@ -93,12 +93,12 @@ class Gaussian(ErrorModel):
         z1, z2 = noise("position 1"), noise("position 2")
         first = self.mean_m[0] + l11 * z1
         second = self.mean_m[1] + l21 * z1 + l22 * z2
-        n = len(look.range_m)
+        n = len(view.range_m)
         if self.frame == "absolute":
             east, north = first, second
             ee, en, nn = np.full(n, a), np.full(n, b), np.full(n, d)
         else:
-            cos, sin = np.cos(look.bearing_rad), np.sin(look.bearing_rad)
+            cos, sin = np.cos(view.bearing_rad), np.sin(view.bearing_rad)
             east, north = cos * first - sin * second, sin * first + cos * second
             ee = cos * cos * a - 2 * cos * sin * b + sin * sin * d
             en = cos * sin * (a - d) + (cos * cos - sin * sin) * b

@@ -49,7 +49,7 @@ _INSTANTS = 600
 
 
 @dataclass(frozen=True)
-class Curve:
+class DetectionCurve:
     """A step function: 0 before the first of `times_s (M,)`, `share (M,)` from each on; limits (M,) or None."""
 
     times_s: Float
@@ -82,14 +82,16 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
 
 
 def endings(rows: pd.DataFrame) -> tuple[Float, Int]:
-    """Time (n,) from the onset to the detection or to the end of the look, and how the look ended (n,)."""
+    """Time (n,) from the onset to the detection or to the end of the episode, and how the episode ended (n,)."""
     detected = rows["time_to_detection_s"].notna().to_numpy()
     looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
     return time_s, np.where(detected, DETECTED, np.where(competes(rows["ended_by"]), LEFT, CENSORED))
 
 
-def curves_of(results: Results, names: Sequence[str], *, bands: bool = True) -> tuple[str | None, dict[str, Curve]]:
+def curves_of(
+    results: Results, names: Sequence[str], *, bands: bool = True
+) -> tuple[str | None, dict[str, DetectionCurve]]:
     """What is resampled whole, or `NOTHING_DRAWN`; and the curves, with bands where there is something to resample."""
     over, cluster = clusters(results.table)
     same = [name for name in names if over == "runs" and fixed_in(results.experiment.as_written()).known(name)]
@@ -102,22 +104,22 @@ def curves_of(results: Results, names: Sequence[str], *, bands: bool = True) -> 
     return over, curves
 
 
-def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Curve:
+def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> DetectionCurve:
     """The curve of one configuration's rows (n,), with a band where it is said which cluster each row is of."""
     if not len(rows):
-        return Curve(np.empty(0), np.empty(0))
+        return DetectionCurve(np.empty(0), np.empty(0))
     time_s, ending = endings(rows)
     times_s, share = cumulative_incidence(time_s, ending)
     if cluster is None or not len(times_s):
-        return Curve(times_s, share)
+        return DetectionCurve(times_s, share)
     # Few enough steps for a file of a bearable size.
     kept = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
     low, high = band(time_s, ending, list(cluster), times_s[kept], seed)
     held = np.searchsorted(kept, np.arange(len(times_s)), side="right") - 1
-    return Curve(times_s, share, low[held], high[held])
+    return DetectionCurve(times_s, share, low[held], high[held])
 
 
-def exact_curve(exact: pd.DataFrame, name: str) -> Curve:
+def exact_curve(exact: pd.DataFrame, name: str) -> DetectionCurve:
     """The probability of being detected by then, every log and object counting the same.
 
     Not the estimator of the runs' curves, which hands the weight of who is censored on to all who remain: be it a
@@ -127,10 +129,10 @@ def exact_curve(exact: pd.DataFrame, name: str) -> Curve:
     known = rows[rows["time_to_detection_s"].notna() & (rows["probability"] > 0)]
     times_s, place = np.unique(known["time_to_detection_s"].to_numpy(dtype=float), return_inverse=True)
     mass = np.bincount(place, weights=known["probability"].to_numpy(dtype=float), minlength=len(times_s))
-    return Curve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id"]).ngroups, 1))
+    return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id"]).ngroups, 1))
 
 
-def _drawn(results: Results, curves: dict[str, Curve], exact: dict[str, Curve]) -> Figure:
+def _drawn(results: Results, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve]) -> Figure:
     looks = appearances(tuple(results.experiment.configurations))
     short = short_names(list(curves))
     begin_s, end_s = time_axis([*curves.values(), *exact.values()])
@@ -193,7 +195,7 @@ def _axes(axes: Axes, begin_s: float, end_s: float) -> None:
     axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
 
 
-def _band(axes: Axes, curve: Curve, name: str, look: Appearance, begin_s: float, end_s: float) -> None:
+def _band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, begin_s: float, end_s: float) -> None:
     if curve.low is None or curve.high is None:
         return
     x, low, high = (_steps(curve.times_s, values, begin_s, end_s) for values in (None, curve.low, curve.high))
@@ -204,7 +206,7 @@ def _band(axes: Axes, curve: Curve, name: str, look: Appearance, begin_s: float,
         axes.step(x, limit, where="post", color=look.edge, linewidth=0.5, alpha=0.7, zorder=1.1)
 
 
-def time_axis(curves: Sequence[Curve]) -> tuple[float, float]:
+def time_axis(curves: Sequence[DetectionCurve]) -> tuple[float, float]:
     """From before the first detection until each curve has come near to its last value."""
     begin_s = min([0.0, *(float(curve.times_s[0]) for curve in curves if len(curve.times_s))])
     end_s = max(curve.nearly_s() for curve in curves)
@@ -212,7 +214,7 @@ def time_axis(curves: Sequence[Curve]) -> tuple[float, float]:
     return begin_s - 0.03 * (end_s - begin_s), end_s
 
 
-def _step(axes: Axes, curve: Curve, begin_s: float, end_s: float, **line: Any) -> list[Any]:
+def _step(axes: Axes, curve: DetectionCurve, begin_s: float, end_s: float, **line: Any) -> list[Any]:
     x, y = (_steps(curve.times_s, values, begin_s, end_s) for values in (None, curve.share))
     return axes.step(x, y, where="post", **line)
 
@@ -227,7 +229,12 @@ def _steps(times_s: Float, values: Float | None, begin_s: float, end_s: float) -
 
 
 def _note(
-    figure: Figure, results: Results, names: Sequence[str], over: str | None, curves: dict[str, Curve], exact: bool
+    figure: Figure,
+    results: Results,
+    names: Sequence[str],
+    over: str | None,
+    curves: dict[str, DetectionCurve],
+    exact: bool,
 ) -> None:
     bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
     if over is None:
@@ -252,6 +259,6 @@ def _note(
     )
 
 
-def _share_at(curve: Curve, time_s: float) -> float:
+def _share_at(curve: DetectionCurve, time_s: float) -> float:
     k = int(np.searchsorted(curve.times_s, time_s, side="right"))
     return float(curve.share[k - 1]) if k else 0.0

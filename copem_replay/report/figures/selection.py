@@ -65,7 +65,7 @@ def choose(
 def worst_to_best(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
     """Four of the configurations: by the share of the rows that pass, then by the mean time to detection.
 
-    Never detected counts as the longest look.
+    Never detected counts as the longest episode.
     """
     longest_s = float((rows["ended_s"] - rows["onset_s"]).max())
     late_s = rows["time_to_detection_s"].fillna(longest_s).groupby(rows["configuration"]).mean()

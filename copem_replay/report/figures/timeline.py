@@ -18,7 +18,7 @@ from copem_replay.metrics.braking.driver import Driver
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.end_reason import EndReason
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.report.figures.trajectories import Course, braked_course, recorded_course
+from copem_replay.report.figures.trajectories import DrivenCourse, braked_course, recorded_course
 
 _STOOD_MPS = 0.05
 """Slower than this the ego has stopped (chosen)."""
@@ -62,7 +62,7 @@ def story(replay: Replay, experiment: Experiment, row: Any) -> Story:
     """What happened, by one row of `detections.parquet`."""
     object_ix = replay.scene.object_number[row.object_id]
     braking = experiment.braking
-    encounter = next((e for e in replay.encounters if replay.looks.object_ix[e.look_ix] == object_ix), None)
+    encounter = next((e for e in replay.encounters if replay.episodes.object_ix[e.episode_ix] == object_ix), None)
     told = [(row.onset_s, "onset", experiment.measure.onset.label(CLASSES[replay.scene.object_class[object_ix]]))]
     result = "never known"
     if row.detected:
@@ -110,7 +110,7 @@ def _outcome(encounter: Encounter, driver: Driver, margin_m: float, row: Any, br
     return course.time_s[nearest], f"passes {row.min_distance_m:.1f} m away"
 
 
-def _stands_from(course: Course, brake_s: float) -> float | None:
+def _stands_from(course: DrivenCourse, brake_s: float) -> float | None:
     """When the ego that brakes stops for good; None: it does not."""
     there = np.flatnonzero(~np.isnan(course.speed_mps) & (course.time_s > brake_s))
     if not len(there) or course.speed_mps[there[-1]] >= _STOOD_MPS:

@@ -13,7 +13,7 @@ import numpy as np
 from copem_replay.core.box_distance import box_distance, pose_on
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float
 from copem_replay.metrics.braking.driver import Driver
-from copem_replay.metrics.braking.ego_path import EgoCourse
+from copem_replay.metrics.braking.ego_path import EgoPath
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import braked
 from copem_replay.pipeline.prepare import Replay
@@ -22,7 +22,7 @@ _SAME_S = SAME_INSTANT_NS * 1e-9
 
 
 @dataclass(frozen=True)
-class Course:
+class DrivenCourse:
     """How the ego drives and how near the object is: all (T,), NaN where the ego (or either) is not in the log."""
 
     time_s: Float
@@ -30,19 +30,21 @@ class Course:
     gap_m: Float  # box to box
 
 
-def recorded_course(replay: Replay, max_gap_s: float, object_ix: int, time_s: Float) -> Course:
+def recorded_course(replay: Replay, max_gap_s: float, object_ix: int, time_s: Float) -> DrivenCourse:
     """As the log has both."""
-    ego = EgoCourse(replay.scene, replay.truth, max_gap_s)
+    ego = EgoPath(replay.scene, replay.truth, max_gap_s)
     course = ego.course(time_s)
     at, present = ego.states(object_ix, time_s)
     other = np.stack([at["x_m"], at["y_m"], at["yaw_rad"]])
     k = int(np.argmax(present))  # sizes do not change
     size_m = np.array([at["length_m"][k], at["width_m"][k]])
     speed = np.where(np.isnan(course.along_m), np.nan, course.speed_mps)
-    return Course(time_s, speed, _gaps(course.along_m, ego.path, ego.size_m, other, size_m))
+    return DrivenCourse(time_s, speed, _gaps(course.along_m, ego.path, ego.size_m, other, size_m))
 
 
-def free_course(replay: Replay, max_gap_s: float, object_ix: int, encounter: Encounter | None, time_s: Float) -> Course:
+def free_course(
+    replay: Replay, max_gap_s: float, object_ix: int, encounter: Encounter | None, time_s: Float
+) -> DrivenCourse:
     """The ego that does not brake: recorded until the onset, then as the encounter is judged, if there is one."""
     course = recorded_course(replay, max_gap_s, object_ix, time_s)
     if encounter is None:
@@ -55,13 +57,13 @@ def free_course(replay: Replay, max_gap_s: float, object_ix: int, encounter: Enc
     return course
 
 
-def braked_course(encounter: Encounter, driver: Driver, brake_s: float, time_s: Float) -> Course:
+def braked_course(encounter: Encounter, driver: Driver, brake_s: float, time_s: Float) -> DrivenCourse:
     """The ego that begins to brake at `brake_s` (inf: never), from the onset on; the object does not react."""
     along_m, speed = (
         np.interp(time_s, encounter.time_s, of[0]) for of in braked(encounter, driver, np.array([brake_s]))
     )
     speed[np.isnan(along_m)] = np.nan
-    course = Course(time_s, speed, _gaps_along(encounter, along_m, time_s))
+    course = DrivenCourse(time_s, speed, _gaps_along(encounter, along_m, time_s))
     # Encounters are timed to a nanosecond.
     beyond = (time_s < encounter.time_s[0] - _SAME_S) | (time_s > encounter.time_s[-1] + _SAME_S)
     course.speed_mps[beyond] = course.gap_m[beyond] = np.nan

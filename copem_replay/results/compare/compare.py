@@ -15,7 +15,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.results.compare.bootstrap import Draws, Whose
 from copem_replay.results.compare.comparable import check_comparable
-from copem_replay.results.compare.configuration_data import Side, side_of
+from copem_replay.results.compare.configuration_data import ConfigurationData, side_of
 from copem_replay.results.compare.equal_ghosts import notes_on_equal_ghosts, why_not
 from copem_replay.results.compare.inputs import read_folders
 from copem_replay.results.compare.labels import Named, chosen, named
@@ -112,11 +112,11 @@ def compare(
     setting = _setting(read, second, false_positives_per_min)
     draws = Draws(read[0].provenance.seed)
     rows: list[dict[str, object]] = []
-    sides: list[Side] = []
+    sides: list[ConfigurationData] = []
     reasons: dict[str, str | None] = {}
     for one in others:
         first = side_of(one, grid)
-        _check_same_looks(one, first, against, second, grid)
+        _check_same_episodes(one, first, against, second, grid)
         sides.append(first)
         cells = np.flatnonzero(first.there & second.there)
         pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
@@ -149,8 +149,8 @@ def compare(
     )
 
 
-def _setting(folders: Sequence[Results], baseline: Side, false_positives_per_min: float | None) -> Setting:
-    """What holds for all pairs; the longest look is that of any folder."""
+def _setting(folders: Sequence[Results], baseline: ConfigurationData, false_positives_per_min: float | None) -> Setting:
+    """What holds for all pairs; the longest episode is that of any folder."""
     measure = folders[0].provenance.measure
     horizon_s = measure["horizon_s"]
     if horizon_s is None:
@@ -161,7 +161,9 @@ def _setting(folders: Sequence[Results], baseline: Side, false_positives_per_min
     return Setting(float(horizon_s), float(measure["gospa"]["power"]), false_positives_per_min)
 
 
-def _check_same_looks(one: Named, first: Side, against: Named, second: Side, grid: Grid) -> None:
+def _check_same_episodes(
+    one: Named, first: ConfigurationData, against: Named, second: ConfigurationData, grid: Grid
+) -> None:
     """Raise InputError where an object is not looked at from and until the same time: no pair then is one."""
     if one.results is against.results:
         return

@@ -23,7 +23,7 @@ _AGAIN = "run the experiment again with --overwrite"
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class AccuracyData:
     """Lists of a configuration against the truth: of each cell `length` of them from `first` on, at `start` in values.
 
     `first` counts in the instants of the cell's log; `available_s` has those of all logs, log by log.
@@ -50,7 +50,7 @@ class Ghosts:
 
 
 @dataclass(frozen=True)
-class Steps:
+class StepData:
     """When each cell is detected (C,) if entries below any threshold up to `existence (C,)` are left out."""
 
     cell: Int
@@ -59,7 +59,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Side:
+class ConfigurationData:
     """A configuration on the grid: columns by cell, that mean nothing where it is not `there`. None: not written."""
 
     label: str
@@ -73,12 +73,12 @@ class Side:
     distance_m: Float
     conflict: Bool | None
     passes: Bool | None
-    accuracy: Accuracy | None
+    accuracy: AccuracyData | None
     ghosts: Ghosts | None
-    steps: Steps | None
+    steps: StepData | None
 
 
-def side_of(one: Named, grid: Grid) -> Side:
+def side_of(one: Named, grid: Grid) -> ConfigurationData:
     """Lay a configuration out. Raises InputError where its tables are damaged or don't go together."""
     import pyarrow.compute as pc
 
@@ -96,7 +96,7 @@ def side_of(one: Named, grid: Grid) -> Side:
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {_AGAIN}")
     braking = results.provenance.braking is not None
     size = len(grid.object_of)
-    return Side(
+    return ConfigurationData(
         label=one.label,
         path=results.folder,
         there=_laid(np.ones(len(cell), dtype=bool), cell, size),
@@ -136,7 +136,7 @@ def _check_once(place: Path, cell: Int, configuration: str) -> None:
         )
 
 
-def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) -> Accuracy | None:
+def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) -> AccuracyData | None:
     if not {"accuracy.parquet", "instants.parquet"} <= set(tables):
         return None
     rows, place = tables["accuracy.parquet"], folder / "accuracy.parquet"
@@ -157,7 +157,7 @@ def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) 
     if (first[kept] < 0).any() or ((first + length)[kept] > last)[length[kept] > 0].any():
         raise InputError(f"{place}: expected lists of instants.parquet, found more; {_AGAIN}")
     start = np.cumsum(length) - length
-    return Accuracy(
+    return AccuracyData(
         start=_laid(start, cell, size),
         length=_laid(length, cell, size),
         first=_laid(first, cell, size),
@@ -197,10 +197,10 @@ def _ghosts(place: Path, tables: dict[str, pa.Table], grid: Grid, configuration:
     )
 
 
-def _steps(tables: dict[str, pa.Table], grid: Grid) -> Steps | None:
+def _steps(tables: dict[str, pa.Table], grid: Grid) -> StepData | None:
     if "thresholds.parquet" not in tables:
         return None
     rows = tables["thresholds.parquet"]
     cell = grid.cells(rows)
     kept = cell >= 0
-    return Steps(cell[kept], number(rows["existence"])[kept], number(rows["detection_s"])[kept])
+    return StepData(cell[kept], number(rows["existence"])[kept], number(rows["detection_s"])[kept])

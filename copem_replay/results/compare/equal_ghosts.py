@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from copem_replay.results.compare.configuration_data import Ghosts, Side, Steps
+from copem_replay.results.compare.configuration_data import ConfigurationData, Ghosts, StepData
 from copem_replay.results.compare.metrics import kept_at, own_rate
 
 FEWEST_GHOSTS = 10
@@ -18,7 +18,9 @@ ONE_VALUE = "all entries claim the same existence, so that none is left out befo
 FEW = f"fewer than {FEWEST_GHOSTS} ghosts would decide"
 
 
-def why_not(first: Side, second: Side, per_min: float | None, *, asked: bool, truth: bool) -> str | None:
+def why_not(
+    first: ConfigurationData, second: ConfigurationData, per_min: float | None, *, asked: bool, truth: bool
+) -> str | None:
     """Why the times of two sides at so many ghosts per minute are no measure; None: they are, or there are none.
 
     `asked`: whether that rate was asked for, else it is the second side's own. `truth`: whether that one is the truth.
@@ -51,7 +53,7 @@ def notes_on_equal_ghosts(reasons: Mapping[str, str | None]) -> Iterator[str]:
         yield f"{labels}: no ttd_rmst_s_equal_ghosts: {reason}"
 
 
-def _tells_apart(ghosts: Ghosts, steps: Steps) -> bool:
+def _tells_apart(ghosts: Ghosts, steps: StepData) -> bool:
     """Whether any threshold leaves out some of the entries but not all."""
     counts = ghosts.at[ghosts.there].sum(axis=0)
     for existence, count in zip(ghosts.existence.tolist(), counts.tolist(), strict=True):

@@ -26,7 +26,7 @@ from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.summary_metrics import METRIC
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
 from copem_replay.results.compare.bootstrap import Whose
-from copem_replay.results.compare.configuration_data import Ghosts, Side, Steps
+from copem_replay.results.compare.configuration_data import ConfigurationData, Ghosts, StepData
 from copem_replay.results.compare.differences import Figure, OfMedians, OfSums, OfTimes, Times
 from copem_replay.results.compare.pairing import Grid
 from copem_replay.results.compare.per_list import together
@@ -66,7 +66,7 @@ class Regret:
     kept: tuple[Kept, Kept] | None = None
 
 
-def regrets(first: Side, second: Side, grid: Grid, setting: Setting) -> Iterator[Regret]:
+def regrets(first: ConfigurationData, second: ConfigurationData, grid: Grid, setting: Setting) -> Iterator[Regret]:
     """Every metric that both sides have what it takes for."""
     cells = np.flatnonzero(first.there & second.there)
     yield Regret("detected_share", _shares(grid, cells, first.detected[cells], second.detected[cells]))
@@ -116,7 +116,7 @@ def _shares(grid: Grid, cells: Int, first: Bool, second: Bool) -> OfSums:
     return _means(grid, cells, first.astype(float), second.astype(float), only)
 
 
-def _times(side: Side, detection_s: Float, cells: Int, share: float = 1.0) -> Times:
+def _times(side: ConfigurationData, detection_s: Float, cells: Int, share: float = 1.0) -> Times:
     """Times of cells (C,), detected at `detection_s (N·S,)` or, NaN, not. To a nanosecond, as in summary."""
     onset_s, detected = side.onset_s[cells], ~np.isnan(detection_s[cells])
     time_s = np.where(detected, detection_s[cells], side.ended_s[cells]) - onset_s
@@ -156,7 +156,9 @@ def own_rate(ghosts: Ghosts) -> float | None:
     return float(ghosts.at[ghosts.there, 0].sum()) / minutes if len(ghosts.existence) and minutes > 0 else None
 
 
-def _at_equal_ghosts(first: Side, second: Side, grid: Grid, cells: Int, setting: Setting) -> Iterator[Regret]:
+def _at_equal_ghosts(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
+) -> Iterator[Regret]:
     kept, times = [], []
     for side in (first, second):
         if side.ghosts is None or side.steps is None or setting.false_positives_per_min is None:
@@ -176,7 +178,7 @@ def _at_equal_ghosts(first: Side, second: Side, grid: Grid, cells: Int, setting:
     yield Regret("ttd_rmst_s_equal_ghosts", figure, (kept[0], kept[1]))
 
 
-def _detected_s(steps: Steps, existence: float, cells: int) -> Float:
+def _detected_s(steps: StepData, existence: float, cells: int) -> Float:
     """(C,) when each cell is detected by entries of at least some existence; NaN: never."""
     detection_s = np.full(cells, np.inf)
     enough = steps.existence >= existence
@@ -184,7 +186,7 @@ def _detected_s(steps: Steps, existence: float, cells: int) -> Float:
     return np.where(np.isinf(detection_s), np.nan, detection_s)
 
 
-def _distances(first: Side, second: Side, grid: Grid, cells: Int) -> OfMedians:
+def _distances(first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int) -> OfMedians:
     known = [np.where(side.detected[cells], side.distance_m[cells], -np.inf) for side in (first, second)]
     placed = ~np.isnan(known[0] + known[1])  # NaN: detected during a gap of the truth, no distance to rank
     return OfMedians(
@@ -195,7 +197,9 @@ def _distances(first: Side, second: Side, grid: Grid, cells: Int) -> OfMedians:
     )
 
 
-def _of_lists(first: Side, second: Side, grid: Grid, cells: Int, power: float) -> Iterator[Regret]:
+def _of_lists(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, power: float
+) -> Iterator[Regret]:
     """Errors and GOSPA; lists are of no object in particular, so that their number stays when objects are resampled."""
     if first.accuracy is None or second.accuracy is None:
         return
@@ -209,7 +213,9 @@ def _of_lists(first: Side, second: Side, grid: Grid, cells: Int, power: float) -
     yield Regret("gospa_m", OfSums(whose=whose, n=n, sums=sums, of=_root(power)))
 
 
-def _ghosts(first: Side, second: Side, ghosts: Ghosts, others: Ghosts, grid: Grid, cells: Int) -> OfSums:
+def _ghosts(
+    first: ConfigurationData, second: ConfigurationData, ghosts: Ghosts, others: Ghosts, grid: Grid, cells: Int
+) -> OfSums:
     """Ghosts over minutes; those that are nearest to no measured object are of their list only."""
     there = ghosts.there & others.there
     cells = cells[there[_places(grid, cells)]]

@@ -10,7 +10,7 @@ import pandas as pd
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS
-from copem_replay.results.compare.configuration_data import Side
+from copem_replay.results.compare.configuration_data import ConfigurationData
 from copem_replay.results.compare.labels import Named
 from copem_replay.results.compare.per_list import shared_instants
 from copem_replay.results.tables import OPTIONAL
@@ -55,7 +55,9 @@ def notes_on_pairs(baseline: str, baseline_there: Bool, there: Mapping[str, Bool
                 yield f"{counted(int(count), 'row')} of {whose} left out: {other} has no such object"
 
 
-def notes_on_instants(baseline: Side, others: Sequence[Side], logs: Sequence[str]) -> Iterator[str]:
+def notes_on_instants(
+    baseline: ConfigurationData, others: Sequence[ConfigurationData], logs: Sequence[str]
+) -> Iterator[str]:
     """Lists that have no list of the other configuration at the same instant."""
     alike: dict[tuple[int, int, int, str], list[str]] = {}
     for side in others:

@@ -14,7 +14,7 @@ from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int
 from copem_replay.results.compare.pairing import Grid
 
 if TYPE_CHECKING:
-    from copem_replay.results.compare.configuration_data import Accuracy
+    from copem_replay.results.compare.configuration_data import AccuracyData
 
 _VALUES = 4_000_000
 """Values paired at a time (chosen: a few hundred MB)."""
@@ -31,7 +31,7 @@ class Together:
     lists: Int  # (L·S,) shared lists in which an object of the cells is measured
 
 
-def together(first: Accuracy, second: Accuracy, grid: Grid, cells: Int) -> Together:
+def together(first: AccuracyData, second: AccuracyData, grid: Grid, cells: Int) -> Together:
     """Pair the lists of cells (C,)."""
     places = len(grid.logs) * grid.runs
     other, offset = _same_instants(first, second)
@@ -57,13 +57,13 @@ def together(first: Accuracy, second: Accuracy, grid: Grid, cells: Int) -> Toget
     return Together(matched, squared, measured, gospa, seen.reshape(places, most).sum(axis=1))
 
 
-def shared_instants(first: Accuracy, second: Accuracy) -> Int:
+def shared_instants(first: AccuracyData, second: AccuracyData) -> Int:
     """(L,) how many instants of each log both have."""
     other, offset = _same_instants(first, second)
     return np.array([int((part >= 0).sum()) for part in np.split(other, offset[1:])], dtype=np.int64)
 
 
-def _same_instants(first: Accuracy, second: Accuracy) -> tuple[Int, Int]:
+def _same_instants(first: AccuracyData, second: AccuracyData) -> tuple[Int, Int]:
     """For each instant of the first, log by log, its number in the second, −1: none; and where each log begins (L,)."""
     found = []
     for mine_s, other_s in zip(first.available_s, second.available_s, strict=True):
@@ -80,7 +80,7 @@ def _same_instants(first: Accuracy, second: Accuracy) -> tuple[Int, Int]:
 
 
 def _aligned(
-    first: Accuracy, second: Accuracy, other: Int, offset: Int, cells: Int, part: Int
+    first: AccuracyData, second: AccuracyData, other: Int, offset: Int, cells: Int, part: Int
 ) -> tuple[Int, Int, Int, Int]:
     """(V,) rows of `cells`, places in the first's values, numbers of its instants, places in the second's values.
 
