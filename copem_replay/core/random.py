@@ -65,23 +65,24 @@ class CounterRng:
     def uniform(self, purpose: str, random_key: RandomKey, runs: Int) -> Float:
         """(S, P) uniform in (0, 1), ends excluded, for runs (S,)."""
         out = np.empty((len(runs), len(random_key.stamp_ns)))
-        _uniform(*self._words(purpose, random_key, runs), out)
+        _uniform(*self.words(purpose, random_key, runs), out)
         return out
 
     def bernoulli(self, purpose: str, random_key: RandomKey, runs: Int, probability: Float) -> Bool:
         """(S, P) True with `probability (P,)`: the addressed uniform is below it (0: never, 1: always)."""
         out = np.empty((len(runs), len(random_key.stamp_ns)), dtype=np.bool_)
-        _bernoulli(*self._words(purpose, random_key, runs), np.ascontiguousarray(probability), out)
+        _bernoulli(*self.words(purpose, random_key, runs), np.ascontiguousarray(probability), out)
         return out
 
     def normal(self, purpose: str, random_key: RandomKey, runs: Int, where: Bool | None = None) -> Float:
         """(S, P) standard normal; 0 where `where (S, P)` is False, which costs nothing."""
         out = np.zeros((len(runs), len(random_key.stamp_ns)))
         mask = np.ones((1, 1), dtype=np.bool_) if where is None else where
-        _normal(*self._words(purpose, random_key, runs), mask, out)
+        _normal(*self.words(purpose, random_key, runs), mask, out)
         return out
 
-    def _words(self, purpose: str, random_key: RandomKey, runs: Int) -> tuple[Words, Words, Words, Words]:
+    def words(self, purpose: str, random_key: RandomKey, runs: Int) -> tuple[Words, Words, Words, Words]:
+        """Key, object's word and stamp of each row (P,), and the runs (S,)."""
         keys = [stable_hash(self.seed, self.log, purpose, unit) for unit in random_key.units]
         key = np.array(keys, dtype=np.uint64)[random_key.unit_ix]
         return key, random_key.object_word, random_key.stamp_ns.astype(np.uint64), runs.astype(np.uint64)
