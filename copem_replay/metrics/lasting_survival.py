@@ -23,7 +23,8 @@ _STEP = 1e-4
 class Lasting:
     """Of lists (P,): with which `share` they go by a held number, of which `process` (−1: none), captured when.
 
-    `tau_s (P,)`: correlation time of that number, the same for all lists of a process; inf: always the same number.
+    `tau_s (P,)`: correlation time of that number, the same for all lists of a process; inf: always the same number,
+    0: a new one at every capture.
     """
 
     process: Int
@@ -74,8 +75,8 @@ def log_sequence(listed: Float, held: Bool, gap_s: Float, share: Float, tau_s: f
     """
     out = np.zeros(len(listed))
     edges = np.unique(np.concatenate([[0.0, 1.0], listed]))
-    with np.errstate(invalid="ignore"):
-        log_same = -gap_s / tau_s
+    with np.errstate(invalid="ignore", divide="ignore"):
+        log_same = np.where(gap_s > 0, -gap_s / tau_s, 0.0)
     _filter(listed, held, log_same, np.ascontiguousarray(share), edges, out)
     return out
 

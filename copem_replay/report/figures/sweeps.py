@@ -31,6 +31,7 @@ AXES = {
     "rate_hz": "Rate of the units (lists per second)",
     "units": "Number of units",
     "penetration_rate": "Share of vehicles that carry a unit",
+    "correlation_s": "Correlation time of detection (s)",
 }
 _ROWS = {
     "pass_share": "Share that passes",
