@@ -255,7 +255,8 @@ def test_chunks_have_the_same_bits(of: str, path: str, rows: int) -> None:
     fusions = {"ideal": {"kind": "ideal"}, "tracker": {"kind": "tracker", "late": "replay"}}
     setup = experiment(
         runs=2, pems={"p": {"couples": [couple], "memory": memory}}, units=units,
-        measure={"onset": {"kind": "appears"}}, configurations={name: {"units": "all", "latency_s": {"mast": 0.3}, "fusion": f} for name, f in fusions.items()},
+        measure={"onset": {"kind": "appears"}},
+        configurations={name: {"units": "all", "latency_s": {"mast": 0.3}, "fusion": f} for name, f in fusions.items()},
     )  # fmt: skip
     whole, pieces = both_ways(setup, [traffic()], rows)
     assert len(pieces.replays[0].chunks) > 1
