@@ -41,6 +41,20 @@ def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
     assert lidar_visibility.auc(score, positive) == pytest.approx(3.5 / 4)
 
 
+def test_the_table_of_the_page_about_memory_is_what_its_tool_prints() -> None:
+    """Exact and sampled; by hand .7^6, .7^11, … of 6, 11, … lists within a second."""
+    done = subprocess.run(
+        [sys.executable, "tools/memory_table.py"], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert done.stdout in (ROOT / "docs/perception-models.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:6]]
+    for rate_hz, fresh, sampled, held, held_sampled in (map(float, row) for row in rows):
+        assert fresh == pytest.approx(0.7 ** (rate_hz + 1), abs=6e-5)
+        assert sampled == pytest.approx(fresh, abs=0.02)
+        assert held == pytest.approx(0.7 * (np.exp(-1 / rate_hz) + 0.7 * -np.expm1(-1 / rate_hz)) ** rate_hz, abs=6e-5)
+        assert held_sampled == pytest.approx(held, abs=0.03)
+
+
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")
 def test_visible_share_tells_what_lidar_sees() -> None:
     """Floors from a spike (.765, .908); without heights the share tells less."""
