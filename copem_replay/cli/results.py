@@ -104,9 +104,14 @@ def report(
     return 0
 
 
-def view(folder: ResultsFolder) -> int:
+def view(
+    folder: ResultsFolder,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve viewer and recordings on 127.0.0.1, for a browser, until interrupted.")
+    ] = False,
+) -> int:
     """Open the recordings of a results folder in the Rerun viewer."""
     from copem_replay.cli.api.results import view as opened
 
-    opened(folder)
+    opened(folder, web=web)
     return 0
