@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from copem_replay.cli.options import Baseline, ResultsFolder, listed
-from copem_replay.cli.terminal import note, say, say_blocks, tidied
+from copem_replay.cli.terminal import note, say, say_blocks, tidied, width_of
 from copem_replay.core.errors import InputError
 
 
 def compare(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Results folders.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, one or several.")],
     configurations: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
     ] = None,
@@ -23,7 +24,7 @@ def compare(
     ] = None,
     false_positives_per_min: Annotated[
         float | None,
-        typer.Option(metavar="X", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
+        typer.Option(metavar="N", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
     ] = None,
     rrd: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write one run of all of them as a Rerun recording (.rrd).")
@@ -33,7 +34,10 @@ def compare(
     ] = None,
     log: Annotated[str | None, typer.Option(metavar="NAME", help="Log in that recording [likewise].")] = None,
 ) -> int:
-    """Compare configurations with a baseline, paired by log, object and run, within or across results folders."""
+    """Compare configurations with a baseline, with intervals.
+
+    They are paired by log, object and run, within a results folder or across several.
+    """
     from copem_replay.cli.api.results import compare as compared
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
 
@@ -53,7 +57,7 @@ def compare(
     if rrd is not None:
         notes += write_beside(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     note(notes)
-    say_blocks([comparison_text(comparison).splitlines()])
+    say_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
     if out is not None:
         write_comparison(comparison, out)
     for file in (out, rrd):
@@ -65,7 +69,7 @@ def compare(
 
 def plot(
     folder: ResultsFolder,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [DIR/figures].")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [FOLDER/figures].")] = None,
     configurations: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Only these [all; of single runs four of them].")
     ] = None,
@@ -77,7 +81,10 @@ def plot(
         str | None, typer.Option(metavar="NAME", help="Log in the figure of single runs [the first].")
     ] = None,
 ) -> int:
-    """Draw the figures of a results folder as PNG and SVG: single runs, distances, detection curves, sweeps."""
+    """Draw the figures of a results folder, as PNG and SVG.
+
+    Single runs, distances at detection, detection curves, where the time goes, sweeps.
+    """
     from copem_replay.cli.api.plot import write_figures
 
     names = listed(configurations)
@@ -92,10 +99,13 @@ def plot(
 
 def report(
     folder: ResultsFolder,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [DIR/report.html].")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [FOLDER/report.html].")] = None,
     baseline: Baseline = None,
 ) -> int:
-    """Write the report of a results folder as one HTML file that opens offline: words, tables, figures, provenance."""
+    """Write the report of a results folder, as one HTML file.
+
+    Words, tables, figures and provenance; it opens offline.
+    """
     from copem_replay.cli.api.results import write_report
 
     path = write_report(folder, out, baseline=baseline)
@@ -110,7 +120,10 @@ def view(
         bool, typer.Option("--web", help="Serve viewer and recordings on 127.0.0.1, for a browser, until interrupted.")
     ] = False,
 ) -> int:
-    """Open the recordings of a results folder in the Rerun viewer."""
+    """Open the recordings of a results folder in the viewer.
+
+    Each opens half a second before the first onset.
+    """
     from copem_replay.cli.api.results import view as opened
 
     opened(folder, web=web)

@@ -660,7 +660,10 @@ class TestCommands:
         assert (refused.code, len(refused.lines)) == (2, 1)
         assert not (out / "report.html").exists()
         ended = call("run", experiment, "--out", out, "--report", "--overwrite")
-        assert (ended.code, ended.out[-2:]) == (0, [f"results in {out}", f"report in {out / 'report.html'}"])
+        assert (ended.code, ended.out[-2:]) == (
+            0,
+            [f"report in {out / 'report.html'}", f"next: copem-replay report {out}"],
+        )
         first = (out / "report.html").read_bytes()
         assert call("report", out).out == [f"report in {out / 'report.html'}"]
         assert (out / "report.html").read_bytes() == first

@@ -104,7 +104,7 @@ class TestUsage:
             ([], "expected a command, one of "),
             (["replay"], "No such command 'replay'."),
             (["--nope"], "No such option: --nope"),
-            (["info"], "Missing argument 'LOG...'."),
+            (["info"], "Missing argument 'LOG'."),
             (["init"], "Missing argument 'LOG'."),
             (["check"], "Missing argument 'EXPERIMENT'."),
             (["check", "a", "b"], "unexpected extra argument"),
@@ -116,10 +116,10 @@ class TestUsage:
             (["run", "e.yaml", "--seed", "1.5"], "Invalid value for '--seed': "),
             (["run", "e.yaml", "--jobs", "0"], "Invalid value for '--jobs': "),
             (["run", "e.yaml", "--jobs", "1000000"], "Invalid value for '--jobs': "),
-            (["compare"], "Missing argument 'DIR...'."),
+            (["compare"], "Missing argument 'FOLDER'."),
             (["compare", "out", "--false-positives-per-min", "-1"], "Invalid value for '--false-positives-per-min': "),
             (["compare", "out", "--false-positives-per-min", "few"], "Invalid value for '--false-positives-per-min': "),
-            (["view"], "Missing argument 'DIR'."),
+            (["view"], "Missing argument 'FOLDER'."),
             (["schema", "all"], "unexpected extra argument"),
         ],
     )
@@ -169,9 +169,9 @@ class TestInstalled:
         done = installed("run", "e.yaml", folder=here)
         assert done.returncode == 0
         assert done.stderr == ""
-        assert done.stdout.splitlines()[0].startswith("configuration  n  list_rate_hz  detected_share")
+        assert done.stdout.splitlines()[0].startswith("configuration  detected_share  95 %")
         assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["GT", "PEM", "coPEM"]
-        assert done.stdout.endswith("results in out/e\n")
+        assert done.stdout.endswith("results in out/e\nnext: copem-replay report out/e\n")
         assert table(here / "out" / "e").shape[0] == 12
 
     def test_wrong_input(self, here: Path) -> None:
@@ -415,7 +415,7 @@ class TestRun:
         ended = call("run", "e.yaml")
         assert ended.code == 0
         assert ended.lines == []
-        assert ended.out.endswith("results in out/e\n")
+        assert ended.out.endswith("results in out/e\nnext: copem-replay report out/e\n")
         assert sorted(written(here / "out" / "e")) == [
             "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
             "lists.parquet", "provenance.json", "summary.csv", "thresholds.parquet",
@@ -453,7 +453,8 @@ class TestRun:
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
-        assert ended.out.splitlines()[1].split() == ["GT", "0", "10", "–", "–", "–", "–", "–", "–", "–"]
+        assert ended.out.splitlines()[1].split() == ["GT", "–", "–", "–", "–", "–", "–", "–"]
+        assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (
             2, ["out/e: nobody was measured, so nothing can be compared: no measured object has an onset"],
