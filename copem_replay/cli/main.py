@@ -61,6 +61,7 @@ for command in (
     results.plot,
     results.report,
     results.view,
+    results.layout,
     inspect.schema,
 ):
     app.command()(command)

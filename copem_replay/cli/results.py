@@ -1,7 +1,8 @@
-"""Commands on results folders: compare, plot, report, view."""
+"""Commands on results folders: compare, plot, report, view, layout."""
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -111,6 +112,31 @@ def report(
     path = write_report(folder, out, baseline=baseline)
     tidied(path)
     say(f"report in {path}")
+    return 0
+
+
+def layout(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder, or a replay.mcap.")],
+    configurations: Annotated[
+        str | None, typer.Option("--compare", metavar="A,B,…", help="These over each other, and each alone.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The layout [beside the replay, as .foxglove.json].")
+    ] = None,
+) -> int:
+    """Write a layout of a replay, for Foxglove and Lichtblick.
+
+    The configurations side by side over the truth, cameras in step; under them when each knows an object.
+    """
+    from copem_replay.core.files import atomic_file
+    from copem_replay.io.write.foxglove_layout import layout_of
+
+    replay = folder / "replay.mcap" if folder.is_dir() else folder
+    made = layout_of(replay, listed(configurations) or ())
+    path = out or replay.with_suffix(".foxglove.json")
+    with atomic_file(path) as scratch:
+        scratch.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    say(f"layout in {path}")
     return 0
 
 
