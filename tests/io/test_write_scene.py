@@ -161,7 +161,8 @@ class TestUncertainty:
         ],
     )
     def test_axes(self, covariance: tuple[float, float, float], expected: tuple[float, float, float]) -> None:
-        assert axes(*covariance) == pytest.approx(expected)
+        found = axes(*(np.array([value]) for value in covariance))
+        assert [float(value[0]) for value in found] == pytest.approx(expected)
 
     def test_ellipses_of_two_sigma_where_a_covariance_is_claimed(self, results: Path) -> None:
         found = [SceneUpdate.FromString(data) for _, data in messages(results / "replay.mcap", "copem/PEM/uncertainty")]

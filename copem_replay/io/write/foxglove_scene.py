@@ -6,6 +6,7 @@ and nothing piles up (entities replace by id and live until deleted).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -128,7 +129,7 @@ def transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
     made = transform_class()(parent_frame_id=parent, child_frame_id=child)
     made.timestamp.FromNanoseconds(time_ns)
     made.translation.x, made.translation.y, made.translation.z = pose.x_m, pose.y_m, pose.z_m
-    made.rotation.z, made.rotation.w = np.sin(pose.yaw_rad / 2), np.cos(pose.yaw_rad / 2)
+    made.rotation.z, made.rotation.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
     encoded: bytes = made.SerializeToString(deterministic=True)
     return encoded
 
@@ -136,5 +137,5 @@ def transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
 def _placed(primitive: Any, pose: Pose, colour: tuple[float, float, float, float]) -> None:
     at, turn, color = primitive.pose.position, primitive.pose.orientation, primitive.color
     at.x, at.y, at.z = pose.x_m, pose.y_m, pose.z_m
-    turn.z, turn.w = np.sin(pose.yaw_rad / 2), np.cos(pose.yaw_rad / 2)
+    turn.z, turn.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
     color.r, color.g, color.b, color.a = colour

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -134,6 +135,4 @@ def _line(out: cdr.Cdr, points: Sequence[tuple[float, float, float]], width: flo
 
 
 def _pose(out: cdr.Cdr, pose: Pose) -> None:
-    out.add(
-        "d", pose.x_m, pose.y_m, pose.z_m, 0.0, 0.0, float(np.sin(pose.yaw_rad / 2)), float(np.cos(pose.yaw_rad / 2))
-    )
+    out.add("d", pose.x_m, pose.y_m, pose.z_m, 0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))
