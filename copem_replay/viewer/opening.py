@@ -114,7 +114,8 @@ def open_viewer(folder: Path, files: Sequence[Path]) -> int:
     known = identities(list(instants))
     port = free_port()
     # The module, not the script: it is there in every environment that has rerun-sdk, whatever the PATH.
-    words = [sys.executable, "-m", "rerun", "--bind", HOST, "--port", str(port), *map(str, files)]
+    # The viewer shows what it opened last.
+    words = [sys.executable, "-m", "rerun", "--bind", HOST, "--port", str(port), *map(str, reversed(files))]
     with subprocess.Popen(words) as process:
         try:
             at = {identity.recording: instants[path] for path, identity in known.items()}

@@ -101,7 +101,8 @@ def serve(folder: Path, files: Sequence[Path]) -> Server:
     instants, known = opening_s(folder, files), identities(files)
     requests = [set_time(known[path], at_s) for path, at_s in instants.items() if path in known]
     assets = viewer_files()
-    assets[PAGE] = opening_page(assets[PAGE], list(named), requests)
+    last_shown = list(reversed(named))  # the viewer shows what it opened last
+    assets[PAGE] = opening_page(assets[PAGE], last_shown, requests)
     return Server(Site(assets, named))
 
 

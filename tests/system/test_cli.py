@@ -1139,14 +1139,15 @@ class TestView:
             (tmp_path / "r" / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / "r" / f"{name}.rrd").touch()
         assert call("view", "r").code == 0
-        assert json.loads(viewer.read_text())[4:] == [str(tmp_path / f"r/{name}.rrd") for name in names]
+        asked = json.loads(viewer.read_text())[4:]
+        assert asked == [str(tmp_path / f"r/{name}.rrd") for name in reversed(names)], "the first is shown: opened last"
 
     def test_opens_all_runs(self, tmp_path: Path, call: Call, viewer: Path) -> None:
         names = ("replay", "replay.configurations_7-12", "replay_7", "replay_worst")
         for name in (*reversed(names), "compared"):
             (tmp_path / f"{name}.rrd").touch()
         assert call("view", ".").code == 0
-        assert json.loads(viewer.read_text())[4:] == [str(tmp_path / f"{name}.rrd") for name in names]
+        assert json.loads(viewer.read_text())[4:] == [str(tmp_path / f"{name}.rrd") for name in reversed(names)]
 
     def test_viewer_that_fails(self, tmp_path: Path, call: Call, viewer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "replay.rrd").touch()

@@ -147,7 +147,7 @@ def test_the_command_serves_until_interrupted(results: Path) -> None:
         url = line.removeprefix("viewer at ").removesuffix(" (Ctrl-C ends it)\n")
         assert url.startswith("http://127.0.0.1:"), line
         page, _ = got(url)
-        assert b'"replay.rrd", "replay_worst.rrd"' in page
+        assert b'"replay_worst.rrd", "replay.rrd"' in page, "the viewer shows what it opened last"
         assert b"https://fonts" not in page
         assert got(f"{url}re_viewer_bg.wasm")[0].startswith(b"\x00asm")
         for name in ("replay.rrd", "replay_worst.rrd"):
