@@ -312,7 +312,7 @@ class TestWords:
             r"other includes 0\.",
             lines[2],
         )
-        assert re.search(r'half \(\+\S+ s <span class="tight">\[0, \S+\]</span>\)', html), "no line breaks within"
+        assert re.search(r'half \(<span class="tight">\+\S+ s \[0, \S+\]</span>\)', html), "no line breaks within"
 
     @pytest.mark.parametrize(
         ("low", "high", "includes"), [(-1.0, 0.0, True), (0.0, 1.0, True), (-1.0, -1e-3, False), (1e-3, 1.0, False)]

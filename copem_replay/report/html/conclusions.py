@@ -22,7 +22,7 @@ from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.tables import NOTHING
 
-_INTERVAL = re.compile(r"\[[^\[\]<]*\]")
+_INTERVAL = re.compile(r"(?:[^\s(]+ (?:s|%|percentage points) )?\[[^\[\]<]*\]")
 
 
 def lead(study: Study) -> Html:
@@ -41,7 +41,7 @@ def more(study: Study) -> Html:
 
 
 def _held_together(sentence: str) -> Html:
-    """No line breaks within an interval."""
+    """No line breaks between a value and its interval, nor within."""
     return Html(_INTERVAL.sub(lambda found: tag("span", Html(found[0]), class_="tight"), text(sentence)))
 
 
