@@ -302,6 +302,18 @@ def test_an_autoregression_fits_what_drifts() -> None:
     assert step / (1 - phi**2) == pytest.approx(0.7, abs=0.2)
 
 
+@pytest.mark.parametrize("path", ["held", "drifts"])
+@pytest.mark.parametrize("of", ["pair", "unit", "object", "all"])
+@pytest.mark.parametrize("correlation_s", [1.0, "always"])
+def test_no_rows_no_numbers(of: str, path: str, correlation_s: Any) -> None:
+    log = two_standing(1.0)
+    parts = [{"share": 0.5, "correlation_s": correlation_s, "of": of, "path": path}]
+    setup = plan({"detection": parts, "position": parts})
+    _, found = seen_by(log, setup, np.arange(3))
+    none = perceive(log.scene, found.take_rows(np.empty(0, dtype=np.int64)), setup, np.arange(3))
+    assert none.valid.shape == (3, 0)
+
+
 def test_names_of_noise() -> None:
     names = ("position 1", "yaw", "length", "width", "height", "speed", "flip")
     assert [quantity_of(name) for name in names] == ["position", "yaw", "size", "size", "size", "speed", "flip"]

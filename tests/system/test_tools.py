@@ -26,6 +26,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 import bench  # noqa: E402
 import bench_fusion  # noqa: E402
 import bench_long  # noqa: E402
+import bench_memory  # noqa: E402
 import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
@@ -39,6 +40,17 @@ def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
     # Of the pairs (positive, negative): .9 > .1, .9 > .5, .5 > .1, .5 = .5: 3.5 of 4
     score, positive = np.array([0.9, 0.5, 0.5, 0.1]), np.array([True, True, False, False])
     assert lidar_visibility.auc(score, positive) == pytest.approx(3.5 / 4)
+
+
+def test_bench_of_memory_remembers_all_that_the_crossing_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, few in (("LISTS", 20), ("OBJECTS", 2), ("RUNS", 2)):
+        monkeypatch.setattr(bench_memory, name, few)
+    assert all(number > 0 for number in bench_memory.numbers().values())
+    plain, found = problems(load(ROOT / "logs/crossing.yaml"))
+    assert plain is not None, found
+    lasting = bench_memory.remembering(plain)
+    assert all(pem.memory.keys() == {"detection", *(pem.asked() or ())} for pem in lasting.pems.values())
+    assert lasting.configurations == plain.configurations
 
 
 def test_the_table_of_the_page_about_memory_is_what_its_tool_prints() -> None:
