@@ -11,7 +11,7 @@ from copem_replay.core.tracks import CLASSES, Scene, Tracks
 from copem_replay.io.write.drawing import Ellipse, Entity, Line, Place, Pose, Rgba, Text, TruthFrame, TruthScene
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
 from copem_replay.perception.field_of_view import outlines
-from copem_replay.perception.sensor_poses import Poses, mounting_height
+from copem_replay.perception.sensor_poses import UnitPoses, mounting_height
 from copem_replay.pipeline.selected_runs import OneRun
 
 BODY: Rgba = (0.62, 0.62, 0.62, 1.0)
@@ -99,7 +99,7 @@ def _unit(one: OneRun, name: str, pose: Pose, *, field: bool = True) -> Entity:
     lines = []
     if field:
         down_m = _ABOVE_M - mounting_height(replay.scene, replay.truth, unit)
-        for border in outlines(one.experiment.pems[str(unit.pem)]):
+        for border in outlines(one.experiment.pems[str(unit.pem)].couples):
             lines.append(Line([(x, y, down_m) for x, y in border.tolist()], FIELD, pose))
     over = Pose(pose.x_m, pose.y_m, pose.z_m + _MARK_M)
     mark = Ellipse((_MARK_M, _MARK_M, _MARK_M / 2), UNIT, pose)
@@ -121,5 +121,5 @@ def _at(truth: Tracks, row: int) -> Pose:
     return Pose(*(float(getattr(truth, name)[0, row]) for name in ("x_m", "y_m", "z_m", "yaw_rad")))
 
 
-def _pose(poses: Poses, k: int) -> Pose:
+def _pose(poses: UnitPoses, k: int) -> Pose:
     return Pose(*(float(column[k]) for column in (poses.x_m, poses.y_m, poses.z_m, poses.heading_rad)))
