@@ -78,14 +78,16 @@ def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
         c2, s2 = ((ee - nn) / 2 / half, en / half) if half > 0 else (1.0, 0.0)
         high = middle + half
         low = max(middle - half, FLATTEST * high)
-        high, low = min(dependent_m2, high), min(dependent_m2, low)
+        if high <= dependent_m2:  # all of it, to the last bit
+            dependent[k] = cov[k]
+            continue
+        high, low = dependent_m2, min(dependent_m2, low)
         dependent[k, 0, 0] = (high + low) / 2 + (high - low) / 2 * c2
         dependent[k, 1, 1] = (high + low) / 2 - (high - low) / 2 * c2
         dependent[k, 0, 1] = dependent[k, 1, 0] = (high - low) / 2 * s2
-        if high + low < ee + nn:
-            for i in range(2):
-                for j in range(2):
-                    independent[k, i, j] = cov[k, i, j] - dependent[k, i, j]
+        for i in range(2):
+            for j in range(2):
+                independent[k, i, j] = cov[k, i, j] - dependent[k, i, j]
     return dependent, independent
 
 

@@ -61,8 +61,14 @@ def split_intersection(x: Array, dependent: Array, independent: Array, by_determ
 
     if n == 1:
         return x[0], dependent[0] + independent[0]
+
+    def bounded(weight: Array) -> float:  # the same as the block matrix gives, block after block
+        share = np.maximum(weight, 1e-9) / np.maximum(weight, 1e-9).sum()
+        parts = np.linalg.inv(dependent / share[:, None, None] + independent)
+        return size(np.linalg.inv(parts.sum(axis=0)), by_determinant)
+
     found = minimize(
-        lambda w: size(best_linear(x, bound(w))[1], by_determinant), np.full(n, 1 / n), method="SLSQP",
+        bounded, np.full(n, 1 / n), method="SLSQP",
         bounds=[(0, 1)] * n, constraints={"type": "eq", "fun": lambda w: w.sum() - 1},
         options={"ftol": 1e-15, "maxiter": 500},
     )  # fmt: skip
