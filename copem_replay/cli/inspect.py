@@ -106,7 +106,7 @@ def source_with(
     """The experiment file, with the options that are given in the place of its keys."""
     from dataclasses import replace
 
-    from copem_replay.experiment.file import load
+    from copem_replay.experiment.file import load, with_logs, without_settings
 
     source = load(path)
     given = {name: value for name, value in changes.items() if value is not None}
@@ -117,6 +117,6 @@ def source_with(
         window = written if isinstance(written, list) and len(written) == len(window_s) else [None, None]
         given["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
         options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
-    if logs:
-        given["logs"] = [str(log) for log in logs]
-    return replace(source, data=source.data | given, options=options, logs=tuple(map(str, logs)))
+    data = without_settings(source.data, [key for key in ("ego", "window_s") if key in given])
+    source = replace(source, data=data | given, options=options)
+    return with_logs(source, [str(log) for log in logs]) if logs else source

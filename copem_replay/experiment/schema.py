@@ -8,13 +8,24 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from copem_replay.communication.link import ConstantLink, LinkModel
-from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, described
+from copem_replay.core.components import Count, Frozen, Id, Positive, Share, Slot, described
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
-from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
+from copem_replay.io.config import Ego, HowRead, Latency, Read, Recorded, WindowOf
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
 from copem_replay.perception.pem.model import Pem
@@ -194,19 +205,48 @@ class Sweep(Frozen):
         return chosen
 
 
-def _how_read(value: object) -> str:
-    named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
-    return "fields" if named else "topic"
+MEASURED_PER_LOG = ("objects", "onset", "distance_to", "annotated")
+"""Keys of `measure` that a log may have its own of; the others say what the tables of all logs have in common."""
 
 
-HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
+class LogSettings(Frozen):
+    """A recording, and what is otherwise for it: keys that are given replace those of the experiment, lists whole.
+
+    `file`: as a plain entry, wildcards too. `name`: what the log is called, by default as its file. Of `units` and
+    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it.
+    """
+
+    file: Annotated[str, Field(min_length=1)]
+    name: Annotated[Id, Field(min_length=1)] | None = None
+    ego: Ego | None = None
+    window_s: WindowOf | None = None
+    units: dict[Id, dict[str, Any] | None] = Field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] | None = None
+    read: HowRead | None = None
+    measure: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("measure")
+    @classmethod
+    def _of_a_log(cls, measure: dict[str, Any]) -> dict[str, Any]:
+        for key in measure:
+            if key not in MEASURED_PER_LOG:
+                names = ", ".join(MEASURED_PER_LOG)
+                raise ValueError(f"{key}: goes for all logs alike; a log has its own {names}")
+        return measure
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Only keys that are given: a `null` would be one, too."""
+        written: dict[str, Any] = write(self)
+        return {key: value for key, value in written.items() if key in self.model_fields_set}
 
 
-def _what_ego(value: object) -> str:
-    return "topic" if isinstance(value, dict | EgoTopic) else "id"
+def _what_log(value: object) -> str:
+    return "settings" if isinstance(value, dict | LogSettings) else "path"
 
 
-Ego = Annotated[Annotated[Id, Tag("id")] | Annotated[EgoTopic, Tag("topic")], Discriminator(_what_ego)]
+LogEntry = Annotated[Annotated[str, Tag("path")] | Annotated[LogSettings, Tag("settings")], Discriminator(_what_log)]
+"""A path, with wildcards or not, or a mapping with settings."""
 
 
 WhichRun = Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst", "best"]
@@ -236,13 +276,6 @@ class Show(Frozen):
         return () if self.run is None else (self.run,)
 
 
-def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
-    from_s, to_s = window_s
-    if from_s is not None and to_s is not None and from_s > to_s:
-        raise ValueError(f"expected [from, to], found one that ends ({to_s:g} s) before it begins ({from_s:g} s)")
-    return window_s
-
-
 def _as_file(schema: dict[str, Any]) -> None:
     """A file has to name its logs; only an experiment that is made in Python may leave them out."""
     described(schema)
@@ -253,7 +286,8 @@ def _as_file(schema: dict[str, Any]) -> None:
 class Experiment(Frozen):
     """An experiment file.
 
-    `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
+    `logs`: paths, or mappings with what is otherwise for a log. `window_s`: what of each log is read, [from, to] in
+    seconds since the first message of its truth was logged.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
@@ -263,10 +297,10 @@ class Experiment(Frozen):
     model_config = ConfigDict(json_schema_extra=_as_file)
 
     version: Annotated[Literal[1], BeforeValidator(_version)]
-    logs: Annotated[tuple[str, ...], Field(min_length=1)] = ()
+    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)] = ()
     read: HowRead = Read()
     ego: Ego | None = None
-    window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None
+    window_s: WindowOf | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1
     seed: Annotated[int, Field(strict=True), AfterValidator(_of_64_bits)] = 0
