@@ -17,7 +17,7 @@ from copem_replay.fusion.base import Fusion, Ideal
 from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
-from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Surface, Visibility
 
 

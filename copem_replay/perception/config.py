@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Protocol, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from copem_replay.core.components import Frozen, Id, NotNegative, Number, Positive, Share
-from copem_replay.perception.pem.condition import ClassNames, Pem
+from copem_replay.perception.pem.condition import ClassNames
 from copem_replay.perception.visibility import VisibilityModel
+
+if TYPE_CHECKING:
+    from copem_replay.perception.pem.model import Pem
 
 Point = tuple[Number, Number]
 
@@ -106,7 +109,7 @@ class PerceptionSetup(Protocol):
 
     @property
     def pems(self) -> Mapping[str, Pem]:
-        """Couples by name."""
+        """Perception error models by name."""
 
     @property
     def units(self) -> Mapping[str, Placement]:

@@ -223,7 +223,7 @@ def _assess(tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup) -> 
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         seen = view.take(rows)
-        pem = experiment.pems[str(unit.pem)]
+        pem = experiment.pems[str(unit.pem)].couples
         couple_ix[rows] = applies(pem, seen)
         for c, couple in enumerate(pem):
             mine = rows[couple_ix[rows] == c]

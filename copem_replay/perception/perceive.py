@@ -84,7 +84,7 @@ def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup,
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
     for unit, mine in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
-        for c, couple in enumerate(experiment.pems[str(unit.pem)]):
+        for c, couple in enumerate(experiment.pems[str(unit.pem)].couples):
             rows = mine[found.couple_ix[mine] == c]
             if couple.error is None or not len(rows):
                 continue

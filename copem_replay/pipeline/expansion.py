@@ -17,7 +17,7 @@ from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.config import Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle
-from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import VisibilityModel
 
 

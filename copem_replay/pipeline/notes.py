@@ -16,7 +16,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
-from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import without_points
@@ -99,7 +99,7 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, at: UnitPoses, carrier_ix: int
     if not len(there):
         return False
     rows = order[bounds[there[0]] : bounds[there[-1] + 1]]
-    anyhow = [couple.when.model_copy(update={"visible_share": None}) for couple in pem]
+    anyhow = [couple.when.model_copy(update={"visible_share": None}) for couple in pem.couples]
     for some in (rows[::_SAMPLE], rows):  # of what is met at all, much is
         frame = world.frame_ix[some]
         kept = at.present[frame] & (world.row_object_ix[some] != carrier_ix)

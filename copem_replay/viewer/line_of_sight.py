@@ -76,7 +76,7 @@ def _look_at(replay: Replay, experiment: Experiment, seen: Sight, part: slice, o
         watching = observers([at], np.array([carrier(scene, unit)]))
         [share] = visible_shares(world, replay.placed.static, watching, experiment.visibility)
         view = _view(at, world, rows, scene.object_class[world.row_object_ix[rows]])
-        pem = experiment.pems[str(unit.pem)]
+        pem = experiment.pems[str(unit.pem)].couples
         in_field = _anywhere(pem, view, "range_m", "azimuth_deg", "classes")
         seen.place_m[u, part] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
         seen.in_range[u, frame, column] = _anywhere(pem, view, "range_m")

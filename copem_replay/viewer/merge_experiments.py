@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
-from copem_replay.perception.pem.condition import Pem
+from copem_replay.perception.pem.model import Pem
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def units(out: Out, replay: Replay, experiment: Experiment) -> None:
             out.columns(path, elapsed_ns, rr.Points3D.columns(positions=place[there]).partition(there.astype(np.int64)))
         out.static(path, style)
         height_m = mounting_height(replay.scene, replay.truth, unit)
-        _field(out, name, unit, at, elapsed_ns, experiment.pems[str(unit.pem)], height_m)
+        _field(out, name, unit, at, elapsed_ns, experiment.pems[str(unit.pem)].couples, height_m)
 
 
 def unit_places(replay: Replay, experiment: Experiment, heard: Tracks) -> Float:

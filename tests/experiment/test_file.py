@@ -651,12 +651,12 @@ class TestProblems:
 
 class TestComponents:
     def test_built_in(self, tmp_path: Path) -> None:
-        (couple,) = experiment(tmp_path, TEXT).pems["onboard"]
+        (couple,) = experiment(tmp_path, TEXT).pems["onboard"].couples
         assert couple.detection == Constant(kind="constant", probability=0.5)
 
     def test_class_of_a_module(self, tmp_path: Path) -> None:
         kind = f"{__name__}:Always"
-        (couple,) = experiment(tmp_path, changed(at(DETECTION, f"kind: '{kind}', sure: false"))).pems["onboard"]
+        (couple,) = experiment(tmp_path, changed(at(DETECTION, f"kind: '{kind}', sure: false"))).pems["onboard"].couples
         assert couple.detection == Always(kind=kind, sure=False)
         (problem,) = problems(tmp_path, changed(at(DETECTION, f"kind: '{kind}', sur: false")))
         assert (
@@ -665,7 +665,7 @@ class TestComponents:
 
     def test_entry_point(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         installed(monkeypatch, always=f"{__name__}:Always", broken="no.such.module:Thing")
-        (couple,) = experiment(tmp_path, changed(at(DETECTION, "kind: always"))).pems["onboard"]
+        (couple,) = experiment(tmp_path, changed(at(DETECTION, "kind: always"))).pems["onboard"].couples
         assert couple.detection == Always(kind="always")
         (problem,) = problems(tmp_path, changed(at(DETECTION, "kind: alway")))
         assert (
@@ -738,7 +738,7 @@ class TestComponents:
         model = VisibleShare()
         data = {"version": 1, "logs": ["a"], "configurations": {"GT": {"units": "truth"}}}
         found = Experiment.model_validate(data | {"pems": {"p": [{"detection": model}]}})
-        assert found.pems["p"][0].detection is model
+        assert found.pems["p"].couples[0].detection is model
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **points: str) -> None:

@@ -243,9 +243,8 @@ def test_units_of_one_name_are_one_only_where_they_are_the_same() -> None:
     both = merged([Part("a", same, labels), Part("b", moved, {"PEM": "b:PEM"}), Part("c", blind, {"PEM": "c:PEM"})])
     assert list(both.units) == ["ego", "mast", "b:mast", "c:ego", "c:mast"]
     assert both.units["b:mast"].at == (-5, 0)
-    assert [c.when.range_m for name in ("mast", "b:mast", "c:mast") for c in both.pems[str(both.units[name].pem)]] == [
-        (0, 50), (0, 50), (0, 20),
-    ]  # fmt: skip
+    pems = [both.pems[str(both.units[name].pem)] for name in ("mast", "b:mast", "c:mast")]
+    assert [couple.when.range_m for pem in pems for couple in pem.couples] == [(0, 50), (0, 50), (0, 20)]
     assert both.units_of(both.configurations["b:PEM"]) == ("ego", "b:mast")
     assert both.units_of(both.configurations["GT"]) == ()
     assert [both.configurations["c:PEM"].latency_of(unit) for unit in ("c:ego", "c:mast")] == [0.1, 0.2]

@@ -1,4 +1,4 @@
-"""A PEM: ordered couples of a condition, a detection model and an error model; the first that applies is used."""
+"""The couples of a PEM: a condition, a detection model and an error model; the first that applies is used."""
 
 from __future__ import annotations
 
@@ -84,12 +84,9 @@ class Couple(Frozen):
     existence: Share | Literal["visible_share"] = 0.9
 
 
-Pem = Annotated[tuple[Couple, ...], Field(min_length=1)]
-
-
-def applies(pem: tuple[Couple, ...], view: ViewGeometry) -> Int:
+def applies(couples: tuple[Couple, ...], view: ViewGeometry) -> Int:
     """(P,) index of the couple that applies to each row, −1 where none does (then it is not detected)."""
     chosen = np.full(len(view.range_m), -1)
-    for k, couple in enumerate(pem):
+    for k, couple in enumerate(couples):
         chosen[(chosen < 0) & couple.when.holds(view)] = k
     return chosen
