@@ -73,6 +73,12 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
             yield source.at(
                 ("measure", "exact"), f"unit {recorded[0]!r} is recorded: nothing says how probable its lists were"
             )
+        off = [name for name, unit in _items(data.get("units")) if unit.get("outages") is not None]
+        if off:
+            yield source.at(
+                ("measure", "exact"),
+                f"unit {off[0]!r} has outages, in which all objects miss all lists together: that has no closed form",
+            )
     if measure.get("exact") is True and isinstance(confirm, dict):
         of = confirm.get("of", 1)
         if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
@@ -142,12 +148,23 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             )
 
 
+def _fusion_of_pose(source: Source, key: Key, fusion: object, data: dict[str, Any]) -> Iterator[str]:
+    """A posterior is drawn around what is expected, anew at each instant: of errors that last it knows nothing."""
+    if not isinstance(fusion, dict) or fusion.get("combine") != "posterior":
+        return
+    if any(unit.get("placed") is not None for _, unit in _items(data.get("units"))):
+        yield source.at(
+            (*key, "fusion"), "combine: posterior draws anew at each instant and has no memory; use samples"
+        )
+
+
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
     chosen = configuration.get("units")
     if chosen == "all" and not _modelled(source.data):
         which = "modelled units; recorded ones are named" if units else "units"
         yield source.at((*key, "units"), f"all: the experiment has no {which}")
     yield from _fusion(source, key, configuration, chosen)
+    yield from _fusion_of_pose(source, key, configuration.get("fusion"), source.data)
     given: list[str] = []
     for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
         if _is_name(unit) and str(unit) not in units:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from copem_replay.communication.link import ConstantLink, LinkModel
-from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, described
+from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, at_key, described
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
 from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
@@ -50,6 +50,13 @@ UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 
 
+_NOT_RECORDED = {
+    "placed": "is where its lists say",
+    "clock": "captures when its lists say",
+    "outages": "makes the lists that are recorded",
+}
+
+
 class Unit(Placement):
     """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
@@ -66,6 +73,9 @@ class Unit(Placement):
         if (self.pem is None) == (self.recorded is None):
             raise ValueError("expected one of `pem: <name>` and `recorded: {topic: …}`")
         if self.recorded is not None:
+            for key, why in _NOT_RECORDED.items():
+                if getattr(self, key) is not None:
+                    raise at_key(key, f"a recorded unit {why}; only for units with a pem")
             if self.rate_hz is not None or isinstance(self.on, Carriers) or (self.on and self.at):
                 raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
             return self

@@ -17,6 +17,7 @@ from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.observation import Observations, rows_by_unit
 from copem_replay.perception.pem.error import errors_of
+from copem_replay.perception.pose_error import misplaced
 
 SMALLEST_SIZE_M = 0.05
 """A size error never makes a box smaller than this (chosen)."""
@@ -51,7 +52,8 @@ def perceive(
     seen = replace(tracks, valid=valid)
     if states == "true":
         return seen
-    return _with_errors(seen, found, experiment, _Draws(rng, random_key, runs, valid, states == "expected"))
+    seen = _with_errors(seen, found, experiment, _Draws(rng, random_key, runs, valid, states == "expected"))
+    return seen if states == "expected" else misplaced(scene, seen, tracks, found.view, experiment, runs)
 
 
 class _Draws:

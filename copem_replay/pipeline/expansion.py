@@ -99,6 +99,16 @@ class ExpandedExperiment:
         """Whether all runs have the same units."""
         return bool((self.share == 1).all())
 
+    @property
+    def outages(self) -> bool:
+        """Whether a unit at times makes no lists: each run then has lists, and instants, of its own."""
+        return any(unit.outages is not None for unit in self.modelled.values())
+
+    @property
+    def runs_apart(self) -> bool:
+        """Whether lists differ from run to run in more than the states of their rows: a block then has one run."""
+        return self.outages
+
     def with_(self, experiment: Experiment) -> ExpandedExperiment:
         """The same units in an experiment that differs in its configurations, or in what is measured.
 

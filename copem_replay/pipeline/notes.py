@@ -37,14 +37,16 @@ def notes_of(
         met = replay.ever_met if replayed else None
         notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
     notes += without_points(experiment)
-    if experiment.measure.accuracy and not same_units(ready):
-        notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+    if experiment.measure.accuracy and not same_instants(ready):
+        outages = any(replay.expanded.outages for replay in ready)
+        why = "outages" if outages else "units that only some runs have"
+        notes.append(f"no accuracy.parquet: {why} give each run its own instants")
     return notes
 
 
-def same_units(ready: Sequence[Replay]) -> bool:
-    """Whether all runs have the same units."""
-    return all(replay.expanded.same_in_all_runs for replay in ready)
+def same_instants(ready: Sequence[Replay]) -> bool:
+    """Whether all runs have the same units, and lists at the same instants."""
+    return all(replay.expanded.same_in_all_runs and not replay.expanded.outages for replay in ready)
 
 
 def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:

@@ -124,9 +124,9 @@ class Replay:
         return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units)
 
     def worlds(
-        self, experiment: Experiment, sending: Bool | None, *, measured_only: bool = False
+        self, experiment: Experiment, runs: Int, sending: Bool | None, *, measured_only: bool = False
     ) -> Iterator[WorldChunk]:
-        """The same chunk by chunk, all of it or what is looked at.
+        """The same chunk by chunk, all of it or what is looked at, for runs (S,) that have the same lists.
 
         `sending (U,)`: the units whose lists the receivers hear, None: all.
         """
@@ -135,7 +135,7 @@ class Replay:
             yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment)
-        units, seen = lists.experiment, seen_by_all(lists, np.arange(1), states="true")
+        units, seen = lists.experiment, seen_by_all(lists, runs[:1], states="true")
         reach = Reach(units, {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations})
         for chunk in self.chunks:
             earliest_s = reach.earliest_s(chunk)

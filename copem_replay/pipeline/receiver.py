@@ -21,6 +21,7 @@ from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, inputs, lists_without_truth
 from copem_replay.perception.observation import Observations
+from copem_replay.perception.outages import without_outages
 from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
@@ -74,11 +75,15 @@ class ReceiverOutput:
 
 
 def seen_by_all(world: WorldChunk, runs: Int, *, states: States, equipped: Bool | None = None) -> Tracks:
-    """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`."""
+    """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`.
+
+    Where units have outages, which lists there are differs from run to run: it is asked for one run at a time.
+    """
     experiment = world.experiment
     if equipped is not None:
         equipped = equipped[:, [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]]
     seen = perceive(world.scene, world.found, experiment, runs, states=states, equipped=equipped)
+    seen = without_outages(world.scene, seen, experiment, runs)
     if world.recorded is None:
         return seen
     recorded = world.recorded.tracks

@@ -197,7 +197,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
     for replay in (whole.replays[0], pieces.replays[0]):
-        worlds = list(replay.worlds(plan, None, measured_only=True))
+        worlds = list(replay.worlds(plan, np.arange(1), None, measured_only=True))
         assert {int(k) for world in worlds for k in world.found.tracks.row_object_ix} == pedestrians
 
 
@@ -272,7 +272,7 @@ def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.Mo
     found = replay.found(WHOLE)
     listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
     assert 0 < len(listed) < len(found.view.range_m) / 2
-    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, None)]
+    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), None)]
     assert set().union(*held) == set(found.view.range_m[listed].tolist())
 
 
