@@ -36,8 +36,8 @@ GROUPS = {
     "Figures": "plot",
     "Keys of an experiment": "Experiment Unit Configuration Measure Onset",
     "Data": "Recording Scene Tracks ObjectLists Inputs Inbox entries_of ViewGeometry Errors CLASSES",
-    "Own components": "DetectionModel ErrorModel StepFusion ListFusion Driver Reaction check_fusion NonconformingError "
-    "FUSION_RULES",
+    "Own components": "DetectionModel ErrorModel VisibilityModel LinkModel SentLists StepFusion ListFusion Driver "
+    "Reaction RowMetric check_fusion NonconformingError FUSION_RULES",
     "Metrics": "gospa ospa cumulative_incidence",
     "Errors": "CopemError InputError ExperimentError RecordingError EmptyWindowError OutputError",
 }

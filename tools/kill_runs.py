@@ -112,7 +112,7 @@ class Trial:
         paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
         return {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
 
-    def episode(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
+    def check(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
         """What a killed run left: it is that of one of two seeds (None: there was nothing)."""
         found.leftovers += len(os.listdir(self.out.parent)) > self.out.exists() if self.out.parent.exists() else 0
         before, seed = seeds
@@ -200,7 +200,7 @@ def kill(
             os.kill(child, signal.SIGKILL)
         found.kills += 1
         found.unscathed += ended(child) is not None
-        trial.view((there, new), found, what)
+        trial.check((there, new), found, what)
         trial.look_again((there, new), found, what)
         (trial.out / _NOTE).write_text("mine\n")
         there = new

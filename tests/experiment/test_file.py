@@ -66,8 +66,8 @@ show: {logs: [first], run: 0}
 class Always(DetectionModel):
     sure: bool = True
 
-    def probability(self, episode: ViewGeometry) -> Float:
-        return episode.visible_share * 0 + 1
+    def probability(self, view: ViewGeometry) -> Float:
+        return view.visible_share * 0 + 1
 
 
 class NoModel(Component):

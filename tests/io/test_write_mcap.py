@@ -224,8 +224,8 @@ def test_details_tell_entries_and_detections(written: Written) -> None:
 def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
     """Object by object in the order of the list: what it was made of, and its variances."""
     fused_tracks, scene = written.run_tracks["mixed"], written.replay.scene
-    fused, heard, episode = fused_tracks.fused, fused_tracks.heard, fused_tracks.view
-    assert episode is not None
+    fused, heard, view = fused_tracks.fused, fused_tracks.heard, fused_tracks.view
+    assert view is not None
     contents = [json.loads(m[4]) for m in messages(written.path) if m[0] == "copem/mixed/detail"]
     assert len(contents) == len(fused.stamp_ns)
     several = 0
@@ -244,8 +244,8 @@ def test_details_are_of_the_object_they_stand_beside(written: Written) -> None:
             several += len(used) > 1
             assert one["units"] == [heard.units[heard.row_unit_ix[k]] for k in used]
             assert one["captured_ns"] == [heard.stamp_ns[heard.frame_ix[k]] for k in used]
-            assert one["range_m"] == [episode.range_m[k] for k in used]
-            assert one["visible_share"] == [episode.visible_share[k] for k in used]
+            assert one["range_m"] == [view.range_m[k] for k in used]
+            assert one["visible_share"] == [view.visible_share[k] for k in used]
             assert [one[name] for name in UNCERTAINTIES] == [getattr(fused, name)[0, p] for name in UNCERTAINTIES]
     assert several > 100
 

@@ -170,10 +170,10 @@ def outcome(
     nearest = np.minimum(found[1:], found[:-1]) - moved
     touching = np.flatnonzero(found <= TOUCH_M)
     still_apart = np.arange(len(nearest)) < (touching[0] if len(touching) else len(nearest))
-    episode = np.flatnonzero(still_apart & (nearest < max(found.min() - 1e-5, TOUCH_M)))
-    if np.isfinite(found.min()) and len(episode):
+    closer = np.flatnonzero(still_apart & (nearest < max(found.min() - 1e-5, TOUCH_M)))
+    if np.isfinite(found.min()) and len(closer):
         share = np.arange(1, FINER) / FINER
-        finer = (time_s[episode, None] + share * (time_s[episode + 1] - time_s[episode])[:, None]).ravel()
+        finer = (time_s[closer, None] + share * (time_s[closer + 1] - time_s[closer])[:, None]).ravel()
         time_s, found = np.concatenate([time_s, finer]), np.concatenate([found, distance(finer)])
     order = np.argsort(time_s)
     time_s, found = time_s[order], found[order]

@@ -68,7 +68,7 @@ def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: i
 
 
 def assert_same(whole: Result, pieces: Result) -> None:
-    assert [replay.chunking for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
+    assert [replay.chunks for replay in whole.replays] == [(WHOLE,)] * len(whole.replays)
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
     assert whole.notes == pieces.notes
@@ -97,7 +97,7 @@ def test_the_sample_logs(name: str, rows: int, configurations: int | None) -> No
     plan = plan.model_copy(update={"runs": 2, "configurations": chosen})
     recordings, _ = read_logs(plan, log_paths(source)[0], source)
     whole, pieces = both_ways(plan, recordings, rows)
-    assert len(pieces.replays[0].chunking) > 5
+    assert len(pieces.replays[0].chunks) > 5
     assert_same(whole, pieces)
 
 
@@ -166,7 +166,7 @@ def plans(draw: st.DrawFn) -> Experiment:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_whatever_is_replayed(plan: Experiment, rows: int) -> None:
     whole, pieces = both_ways(plan, [traffic()], rows)
-    assert len(pieces.replays[0].chunking) > 1
+    assert len(pieces.replays[0].chunks) > 1
     assert_same(whole, pieces)
 
 
@@ -179,7 +179,7 @@ def test_recorded_units(tmp_path: Path) -> None:
     path = test_recorded.drive(tmp_path / "drive.mcap", *lists)
     plan = test_recorded.plan_of(path, unit={"delay_s": 0.17})
     whole, pieces = both_ways(plan, [test_recorded.read(path, unit={"delay_s": 0.17})], 10)
-    assert len(pieces.replays[0].chunking) > 3
+    assert len(pieces.replays[0].chunks) > 3
     assert_same(whole, pieces)
 
 
@@ -192,7 +192,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
         },
     )  # fmt: skip
     whole, pieces = both_ways(plan, [traffic()], 60)
-    assert len(pieces.replays[0].chunking) > 5
+    assert len(pieces.replays[0].chunks) > 5
     assert whole.table["conflict_detection_s"].notna().any()
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
@@ -216,7 +216,7 @@ def test_a_fusion_that_is_not_resumable_gets_all_at_once() -> None:
     }
     plan = experiment(pems={"sure": NOISY}, configurations=own)
     whole, pieces = both_ways(plan, [traffic()], 50)
-    assert pieces.replays[0].chunking == (WHOLE,)
+    assert pieces.replays[0].chunks == (WHOLE,)
     assert_same(whole, pieces)
 
 
@@ -225,7 +225,7 @@ def test_chunks_cover_the_log_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
     log = traffic()
     replay = prepare(log, experiment())
-    cuts = replay.chunking
+    cuts = replay.chunks
     assert (cuts[0].from_s, cuts[-1].until_s) == (-np.inf, np.inf)
     assert all(one.until_s == after.from_s for one, after in pairwise(cuts))
     rows = [len(replay.found(time_chunk).tracks.frame_ix) for time_chunk in cuts]
@@ -294,7 +294,7 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     list(RunTracks(replay, plan, 0))
     rows = len(replay.truth.frame_ix)
     # What a time chunk needs from before it is looked at with it once more: 0.4 s and a list of 6 objects at 10 Hz.
-    assert rows <= sum(views) <= rows + (len(replay.chunking) - 1) * 6 * 6
+    assert rows <= sum(views) <= rows + (len(replay.chunks) - 1) * 6 * 6
 
 
 def test_how_far_back_a_chunk_reaches() -> None:

@@ -17,7 +17,7 @@ from copem_replay.experiment.file import load
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.metrics.intervals import wilson
 from copem_replay.pipeline.run import run
-from tests.helpers.reports import reports_of
+from tests.helpers.reports import inputs_of
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -116,7 +116,7 @@ def test_what_units_report_in_fusion_benchmarks() -> None:
     told, truth = bench_fusion.scene(50, 4, 20)
     lists = [told.lists.of(0, f) for f in range(80)]
     units = [told.units[u] for u in told.unit_ix]
-    plain = reports_of([lists], units, told.captured_s.tolist(), told.arrives_s.tolist())
+    plain = inputs_of([lists], units, told.captured_s.tolist(), told.arrives_s.tolist())
     for name in ("unit_ix", "captured_s", "arrives_s", "issue_s", "newest", "arrived", "arrived_start"):
         assert getattr(told, name).tolist() == getattr(plain, name).tolist(), name
     assert told.lists.start.tolist() == plain.lists.start.tolist()
