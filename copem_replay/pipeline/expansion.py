@@ -14,6 +14,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.fusion.base import ListFusion
 from copem_replay.io.config import Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle
@@ -107,7 +108,14 @@ class ExpandedExperiment:
     @property
     def runs_apart(self) -> bool:
         """Whether lists differ from run to run in more than the states of their rows: a block then has one run."""
-        return self.outages
+        return self.outages or any(
+            isinstance(configuration.fusion, ListFusion)
+            and any(self._apart(self.units[name]) for name in self.units_of(configuration))
+            for configuration in self.configurations.values()
+        )
+
+    def _apart(self, unit: Unit) -> bool:
+        return unit.clock is not None
 
     def with_(self, experiment: Experiment) -> ExpandedExperiment:
         """The same units in an experiment that differs in its configurations, or in what is measured.

@@ -12,6 +12,7 @@ from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.base import Ideal
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
@@ -64,12 +65,21 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})"
+    yield from _clocks(experiment)
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
         late = [unit for unit in units if (configuration.latency_of(unit) or 0.0) > end_s]
         if late:
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
+
+
+def _clocks(experiment: Experiment) -> Iterator[str]:
+    """Which configurations know the true captures although a unit's clock is off."""
+    for name, configuration in experiment.configurations.items():
+        off = [unit for unit in experiment.units_of(configuration) if experiment.units[unit].clock is not None]
+        if off and isinstance(configuration.fusion, Ideal):
+            yield f"configuration {name}: ideal fusion goes by true captures and ignores the clock of {', '.join(off)}"
 
 
 def could_meet(replay: Replay) -> Bool:

@@ -26,6 +26,7 @@ from copem_replay.pipeline.chunking import Reach, time_chunks
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
 from copem_replay.pipeline.scoring import TruthCache
+from copem_replay.pipeline.stated_captures import stated_captures
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,11 @@ class Replay:
             return
         lists = self.lists_only(experiment)
         units, seen = lists.experiment, seen_by_all(lists, runs[:1], states="true")
-        reach = Reach(units, {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations})
+        heard = {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations}
+        stated = None
+        if units.runs_apart:
+            stated = {name: stated_captures(self.scene, of, units, int(runs[0])) for name, of in heard.items()}
+        reach = Reach(units, heard, stated)
         for chunk in self.chunks:
             earliest_s = reach.earliest_s(chunk)
             found = self.found(chunk, earliest_s).listable

@@ -25,6 +25,7 @@ from copem_replay.perception.outages import without_outages
 from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.stated_captures import StatedCaptures, stated_captures
 
 if TYPE_CHECKING:
     from copem_replay.io.recorded_units import RecordedUnits
@@ -54,7 +55,8 @@ class ReceiverOutput:
 
     `fused_tracks`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without
     truth ids, or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell;
-    `whole`: the instants are those of the whole log, not of a time chunk.
+    `whole`: the instants are those of the whole log, not of a time chunk. `stated`: what a fusion was told of captures,
+    in one run; None: the truth.
     """
 
     heard: Tracks
@@ -64,14 +66,25 @@ class ReceiverOutput:
     fused: ObjectLists | None
     tells_of: TellsOf = "capture"
     whole: bool = True
+    stated: StatedCaptures | None = None
 
     @cached_property
     def lists(self) -> ObjectLists:
-        """The fused lists without truth ids."""
+        """The fused lists without truth ids; their entries go back to true captures."""
+        return self.told if self.stated is None else self.stated.true_lists(self.told, self.at.issue_s)
+
+    @cached_property
+    def told(self) -> ObjectLists:
+        """The same with the captures that their entries tell of."""
         if self.fused is not None:
             return self.fused
         assert self.fused_tracks is not None
         return as_lists(self.fused_tracks, self.scene)
+
+    @property
+    def captures_told_s(self) -> Float:
+        """(F,) the captures of the lists that were heard, as fusion was told of them."""
+        return self.heard.captured_s if self.stated is None else self.stated.stated_s
 
 
 def seen_by_all(world: WorldChunk, runs: Int, *, states: States, equipped: Bool | None = None) -> Tracks:
@@ -158,13 +171,19 @@ class Receivers:
             if isinstance(fusion, ListFusion):
                 if not without_truth:
                     without_truth.append(_without_truth(world, seen_in("sampled"), self._runs))
-                told = inputs(heard, without_truth[0], max_age_s=max_age_s, at=at)
+                stated, lists = None, without_truth[0]
+                if experiment.runs_apart:  # then the block has one
+                    stated = stated_captures(world.scene, heard, experiment, int(self._runs[0]))
+                if stated is not None:
+                    lists = stated.as_told(lists)
+                captured_s = None if stated is None else stated.stated_s
+                told = inputs(heard, lists, max_age_s=max_age_s, at=at, captured_s=captured_s)
                 where = f"configurations.{name}.fusion"
                 if fusion.resumable:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
                 else:  # such a log is one time chunk
                     fused = fused_by(fusion, told, where)
-                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole)
+                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole, stated)
                 continue
             fused_tracks = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
             if not of_truth and world.recorded is None:
