@@ -77,6 +77,12 @@ class Draws:
         tau_s = part.correlation_s
         if isinstance(tau_s, str):  # always
             return self._once(purpose, always(random_key), normal)
+        if tau_s == 0:  # of a sweep: new in every list
+            return (
+                self.rng.normal(purpose, random_key, self.runs)
+                if normal
+                else self.rng.uniform(purpose, random_key, self.runs)
+            )
         if not drifts:
             found = held(self.rng, purpose, random_key, self.runs, tau_s, where=where)
             if normal:

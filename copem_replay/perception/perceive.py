@@ -5,6 +5,7 @@ Detection is decided first, then the error is sampled, as in the paper.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
@@ -12,11 +13,14 @@ from typing import Any, Literal
 import numpy as np
 
 from copem_replay.core.interpolation import wrap
+from copem_replay.core.lasting import ListTimes
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.config import PerceptionSetup
+from copem_replay.perception.draws import Draws
 from copem_replay.perception.observation import Observations, rows_by_unit
 from copem_replay.perception.pem.error import errors_of
+from copem_replay.perception.pem.memory import Part, Parts, quantity_of
 from copem_replay.perception.pose_error import misplaced
 
 SMALLEST_SIZE_M = 0.05
@@ -39,38 +43,61 @@ def perceive(
     does not depend on `states`.
     """
     tracks = found.tracks
-    rng = CounterRng(experiment.seed, scene.log)
     random_key = RandomKey(
         tracks.units,
         tracks.row_unit_ix,
         object_words(scene.object_ids)[tracks.row_object_ix],
         tracks.stamp_ns[tracks.frame_ix],
     )
-    valid = rng.bernoulli("detection", random_key, runs, found.probability)
+    lists = ListTimes(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
+    draws = Draws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
+    valid = _listed(found, experiment, draws)
     if equipped is not None:
         valid &= equipped[:, tracks.row_unit_ix]
     seen = replace(tracks, valid=valid)
     if states == "true":
         return seen
-    seen = _with_errors(seen, found, experiment, _Draws(rng, random_key, runs, valid, states == "expected"))
-    return seen if states == "expected" else misplaced(scene, seen, tracks, found.view, experiment, runs)
+    return with_states(scene, seen, found, experiment, None if states == "expected" else draws)
 
 
-class _Draws:
-    """Hands standard normals to the error models, by row; zeros where the expected state is asked for."""
-
-    def __init__(self, rng: CounterRng, random_key: RandomKey, runs: Int, valid: Bool, zero: bool) -> None:
-        self._rng, self._address, self._runs, self._valid, self._zero = rng, random_key, runs, valid, zero
-
-    def normal(self, rows: Int, name: str) -> Float:
-        if self._zero:
-            return np.zeros((len(self._runs), len(rows)))
-        return self._rng.normal(
-            f"error {name}", self._address.take(rows), self._runs, np.ascontiguousarray(self._valid[:, rows])
-        )
+def with_states(
+    scene: Scene, seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: Draws | None
+) -> Tracks:
+    """What was listed with the errors of its couples and of the units' poses; `draws` None: the expected ones."""
+    seen = _with_errors(seen, found, experiment, draws)
+    return seen if draws is None else misplaced(scene, seen, found.tracks, found.view, experiment, draws.runs)
 
 
-def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: _Draws) -> Tracks:
+def _listed(found: Observations, experiment: PerceptionSetup, draws: Draws) -> Bool:
+    """(S, P) what is detected: its addressed uniform is below its probability (0: never, 1: always)."""
+    P = len(found.probability)
+    by_parts: dict[tuple[Part, ...], list[Int]] = {}
+    for unit, mine in zip(experiment.modelled.values(), rows_by_unit(found.tracks), strict=True):
+        pem = experiment.pems[str(unit.pem)]
+        for c in range(len(pem.couples)):
+            if parts := pem.memory_of(c).get("detection", ()):
+                by_parts.setdefault(parts, []).append(mine[found.couple_ix[mine] == c])
+    if not by_parts:
+        return draws.rng.bernoulli("detection", draws.random_key, draws.runs, found.probability)
+    valid = np.empty((len(draws.runs), P), dtype=np.bool_)
+    fresh = np.ones(P, dtype=np.bool_)
+    for parts, pieces in by_parts.items():
+        rows = np.sort(np.concatenate(pieces))
+        fresh[rows] = False
+        valid[:, rows] = draws.take(rows).uniform("detection", parts) < found.probability[rows]
+    rest = np.flatnonzero(fresh)
+    valid[:, rest] = draws.rng.bernoulli("detection", draws.random_key.take(rest), draws.runs, found.probability[rest])
+    return valid
+
+
+def _noise(draws: Draws | None, memory: Mapping[str, Parts], valid: Bool, name: str) -> Float:
+    """What an error model is handed for its rows: standard normals where listed; zeros where no draws are wanted."""
+    if draws is None:
+        return np.zeros(valid.shape)
+    return draws.normal(f"error {name}", memory.get(quantity_of(name), ()), np.ascontiguousarray(valid))
+
+
+def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: Draws | None) -> Tracks:
     S, P = seen.valid.shape
     columns: dict[str, Any] = {}
 
@@ -86,12 +113,15 @@ def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup,
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
     for unit, mine in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
-        for c, couple in enumerate(experiment.pems[str(unit.pem)].couples):
+        pem = experiment.pems[str(unit.pem)]
+        for c, couple in enumerate(pem.couples):
             rows = mine[found.couple_ix[mine] == c]
             if couple.error is None or not len(rows):
                 continue
             where = f"pems.{unit.pem}[{c}].error"
-            errors = errors_of(couple.error, found.view.take(rows), partial(draws.normal, rows), S, where)
+            drawn = None if draws is None else draws.take(rows)
+            noise = partial(_noise, drawn, pem.memory_of(c), seen.valid[:, rows])
+            errors = errors_of(couple.error, found.view.take(rows), noise, S, where)
             per_run("x_m")[:, rows] += errors.east_m
             per_run("y_m")[:, rows] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from copem_replay.core.components import Frozen, NotNegative, Number, Share, Slot
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.pem.detection import DETECTION_MODELS, DetectionModel
-from copem_replay.perception.pem.error import ERROR_MODELS, ErrorModel
+from copem_replay.perception.pem.error import ERROR_MODELS, ErrorModel, names_asked
+from copem_replay.perception.pem.memory import QUANTITIES, Memory, check_names, quantity_of
 
 _ON_THE_BOUND = 1e-9
 """Bounds are included; a value this far outside is on the bound (metres, radians, shares)."""
@@ -75,13 +76,26 @@ class Couple(Frozen):
     """(d_c, p_c) under condition c: the paper's element of a PEM. Without `error` the state is exact.
 
     `existence`: how probable the unit claims it to be that there is an object, of each entry alike (0.9 is chosen), or
-    by its visible share: the more of it is seen, the surer the unit.
+    by its visible share: the more of it is seen, the surer the unit. `memory`: which draws last where this couple
+    applies, in place of the PEM's.
     """
 
     when: Condition = Condition()
     detection: Annotated[DetectionModel, Slot("detection", DETECTION_MODELS)]
     error: Annotated[ErrorModel, Slot("error", ERROR_MODELS)] | None = None
     existence: Share | Literal["visible_share"] = 0.9
+    memory: Memory | None = Field(default=None, exclude_if=lambda memory: memory is None)
+
+    @model_validator(mode="after")
+    def _asked(self) -> Self:
+        if self.memory is not None and self.memory.keys() - set(QUANTITIES):
+            check_names(self.memory, self.asked(), "couple")
+        return self
+
+    def asked(self) -> frozenset[str] | None:
+        """The quantities that its error model draws; None where one of the user's own does not say."""
+        names = frozenset[str]() if self.error is None else names_asked(self.error)
+        return None if names is None else frozenset(map(quantity_of, names))
 
 
 def applies(couples: tuple[Couple, ...], view: ViewGeometry) -> Int:

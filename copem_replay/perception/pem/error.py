@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from copem_replay.core.components import Component, Covariance, NotNegative, Pair, asked, wrong
+from copem_replay.core.own_code import FAILURES
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 
@@ -65,6 +66,21 @@ def errors_of(model: ErrorModel, view: ViewGeometry, noise: Noise, runs: int, wh
         if not np.isfinite(values).all():
             raise wrong(model, where, f"perturb: {field.name}: expected numbers, found NaN or infinity", "perturb")
     return found
+
+
+def names_asked(model: ErrorModel) -> frozenset[str] | None:
+    """The names by which a model asks for noise, found by asking it about no row; None where it fails at that."""
+    asked: set[str] = set()
+
+    def noise(name: str) -> Float:
+        asked.add(name)
+        return np.zeros((1, 0))
+
+    try:
+        model.perturb(ViewGeometry(*np.zeros((len(fields(ViewGeometry)), 0))), noise)
+    except FAILURES:  # a user's own may not expect that there is none
+        return None
+    return frozenset(asked)
 
 
 class Gaussian(ErrorModel):

@@ -14,7 +14,6 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
 
 from copem_replay.core.components import Frozen, Id, Share
 
-ALWAYS = "always"
 QUANTITIES = ("detection", "position", "yaw", "speed", "size", "class", "existence")
 """What any PEM may have drawn; models of the user's own have names of their own besides."""
 _OF_SIZE = ("length", "width", "height")

@@ -1,26 +1,28 @@
-"""A PEM as an experiment has it: its couples, and what else its lists get wrong.
+"""A PEM as an experiment has it: its couples, and what of their draws lasts.
 
 A list of couples is the short form, and is written again where nothing else is said.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Self
 
 from pydantic import Field, GetJsonSchemaHandler, SerializerFunctionWrapHandler, model_serializer, model_validator
 from pydantic_core import CoreSchema
 
 from copem_replay.core.components import Frozen
 from copem_replay.perception.pem.condition import Couple
+from copem_replay.perception.pem.memory import QUANTITIES, Memory, Parts, check_names
 
 _OF_A_COUPLE = frozenset(Couple.model_fields) - {"memory"}
 
 
 class Pem(Frozen):
-    """A perception error model: ordered couples, the first that applies is used, and what else is wrong with lists."""
+    """A perception error model: ordered couples, the first that applies is used, and the `memory` of their draws."""
 
     couples: Annotated[tuple[Couple, ...], Field(min_length=1)]
+    memory: Memory = Field(default_factory=dict, exclude_if=lambda memory: not memory)
 
     @model_validator(mode="before")
     @classmethod
@@ -34,6 +36,12 @@ class Pem(Frozen):
             raise ValueError(f"expected a list, found {found}; of couples (each begins with `- `), or `couples: […]`")
         return value
 
+    @model_validator(mode="after")
+    def _asked(self) -> Self:
+        if self.memory.keys() - set(QUANTITIES):
+            check_names(self.memory, self.asked(), "PEM")
+        return self
+
     @model_serializer(mode="wrap")
     def _as_list(self, handler: SerializerFunctionWrapHandler) -> Any:
         written = handler(self)
@@ -44,3 +52,25 @@ class Pem(Frozen):
         """JSON Schema: both forms."""
         found = handler(core_schema)
         return {"anyOf": [handler.resolve_ref_schema(found)["properties"]["couples"], found]}
+
+    def asked(self) -> frozenset[str] | None:
+        """The quantities that its error models draw; None where one of the user's own does not say."""
+        each = [couple.asked() for couple in self.couples]
+        return None if None in each else frozenset[str]().union(*(one for one in each if one is not None))
+
+    def memory_of(self, couple: int) -> Mapping[str, Parts]:
+        """What of a couple's draws lasts: as the couple says, or as the PEM does."""
+        own = self.couples[couple].memory
+        return self.memory if own is None else own
+
+    @property
+    def remembers(self) -> bool:
+        """Whether anything lasts."""
+        return any(self.memory_of(c) for c in range(len(self.couples)))
+
+    def in_vain(self) -> Iterator[str]:
+        """Quantities that are remembered and that no couple draws."""
+        asked = self.asked()
+        for name in self.memory if asked is not None else ():
+            if name not in ("detection", *(asked or ())):
+                yield name
