@@ -42,6 +42,18 @@ def perceive(
     detection times by truth id need), the expected ones (true state plus the mean error) or sampled. What was listed
     does not depend on `states`.
     """
+    tracks, draws = found.tracks, draws_of(scene, found, experiment, runs)
+    valid = _listed(found, experiment, draws)
+    if equipped is not None:
+        valid &= equipped[:, tracks.row_unit_ix]
+    seen = replace(tracks, valid=valid)
+    if states == "true":
+        return seen
+    return with_states(scene, seen, found, experiment, None if states == "expected" else draws)
+
+
+def draws_of(scene: Scene, found: Observations, experiment: PerceptionSetup, runs: Int) -> Draws:
+    """The numbers of the rows of objects (P,) in the runs (S,)."""
     tracks = found.tracks
     random_key = RandomKey(
         tracks.units,
@@ -50,14 +62,7 @@ def perceive(
         tracks.stamp_ns[tracks.frame_ix],
     )
     lists = ListTimes(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
-    draws = Draws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
-    valid = _listed(found, experiment, draws)
-    if equipped is not None:
-        valid &= equipped[:, tracks.row_unit_ix]
-    seen = replace(tracks, valid=valid)
-    if states == "true":
-        return seen
-    return with_states(scene, seen, found, experiment, None if states == "expected" else draws)
+    return Draws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
 
 
 def with_states(

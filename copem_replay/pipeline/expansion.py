@@ -114,8 +114,13 @@ class ExpandedExperiment:
             for configuration in self.configurations.values()
         )
 
+    @property
+    def draws_claims(self) -> bool:
+        """Whether a PEM draws more than states: ghosts, classes, scores or track ids."""
+        return any(self.pems[str(unit.pem)].draws_claims for unit in self.modelled.values())
+
     def _apart(self, unit: Unit) -> bool:
-        return unit.clock is not None
+        return unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
 
     def with_(self, experiment: Experiment) -> ExpandedExperiment:
         """The same units in an experiment that differs in its configurations, or in what is measured.

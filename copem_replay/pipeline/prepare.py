@@ -122,7 +122,7 @@ class Replay:
     def world(self, experiment: Experiment) -> WorldChunk:
         """The log as the units of an experiment have it, by configuration."""
         units = self.expanded.with_(experiment)
-        return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units)
+        return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units, placed=self.placed)
 
     def worlds(
         self, experiment: Experiment, runs: Int, sending: Bool | None, *, measured_only: bool = False
@@ -152,6 +152,8 @@ class Replay:
                 None if self.recorded is None else self.recorded.captured_between(earliest_s, chunk.until_s),
                 units,
                 chunk,
+                self.placed,
+                earliest_s,
             )
 
     def lists_only(self, experiment: Experiment) -> WorldChunk:

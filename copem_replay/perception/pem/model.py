@@ -12,8 +12,12 @@ from pydantic import Field, GetJsonSchemaHandler, SerializerFunctionWrapHandler,
 from pydantic_core import CoreSchema
 
 from copem_replay.core.components import Frozen
+from copem_replay.perception.pem.classes import Classes
 from copem_replay.perception.pem.condition import Couple
+from copem_replay.perception.pem.ghosts import Ghosts
 from copem_replay.perception.pem.memory import QUANTITIES, Memory, Parts, check_names
+from copem_replay.perception.pem.scores import Scores
+from copem_replay.perception.pem.track_ids import TrackIds
 
 _OF_A_COUPLE = frozenset(Couple.model_fields) - {"memory"}
 
@@ -23,6 +27,9 @@ class Pem(Frozen):
 
     couples: Annotated[tuple[Couple, ...], Field(min_length=1)]
     memory: Memory = Field(default_factory=dict, exclude_if=lambda memory: not memory)
+    ghosts: tuple[Ghosts, ...] = Field(default=(), exclude_if=lambda ghosts: not ghosts)
+    classes: Classes | None = Field(default=None, exclude_if=lambda classes: classes is None)
+    tracks: TrackIds | None = Field(default=None, exclude_if=lambda tracks: tracks is None)
 
     @model_validator(mode="before")
     @classmethod
@@ -62,6 +69,17 @@ class Pem(Frozen):
         """What of a couple's draws lasts: as the couple says, or as the PEM does."""
         own = self.couples[couple].memory
         return self.memory if own is None else own
+
+    @property
+    def draws_claims(self) -> bool:
+        """Whether what entries say beside their states, or which entries there are about nobody, is drawn."""
+        scores = any(isinstance(couple.existence, Scores) for couple in self.couples)
+        return scores or bool(self.ghosts) or self.classes is not None or self.tracks is not None
+
+    @property
+    def ghosts_in_list(self) -> float:
+        """How many ghosts there are in a list on average; of those beside objects as if there were one object."""
+        return sum(sort.in_list for sort in self.ghosts)
 
     @property
     def remembers(self) -> bool:
