@@ -177,6 +177,19 @@ def commands() -> Iterator[dict[str, object]]:
         yield {"demo_s": round(seconds, 2), "demo_peak_mb": round(peak_kib / 1024)}
 
 
+def reports() -> Iterator[dict[str, object]]:
+    """Seconds of `copem-replay report` on the sample (6 configurations) and the crossing (18), kilobytes of each."""
+    tool = [sys.executable, "-m", "copem_replay.cli.main"]
+    with _scratch() as folder:
+        for name, key in (("tc016d", "report"), ("crossing", "report_18")):
+            out = folder / name
+            run = [*tool, "run", str(ROOT / f"logs/{name}.yaml"), "--out", str(out)]
+            subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
+            command = [*tool, "report", str(out)]
+            seconds = best(lambda command=command: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 3)
+            yield {f"{key}_s": round(seconds, 2), f"{key}_kb": round((out / "report.html").stat().st_size / 1000)}
+
+
 def fusion() -> Iterator[dict[str, object]]:
     """Fused lists per second on the crossing, and how the time of one grows; see bench_fusion.py."""
     experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
@@ -264,7 +277,7 @@ def _plain_loop(path: Path) -> int:
     return len(pd.DataFrame(rows))
 
 
-BENCHES = (visibility, paper, reading, writing, commands, fusion, peers, crowd, long)
+BENCHES = (visibility, paper, reading, writing, commands, reports, fusion, peers, crowd, long)
 
 if __name__ == "__main__":
     main(sys.argv[1:])

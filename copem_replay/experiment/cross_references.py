@@ -139,6 +139,8 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
         yield source.at(("sweep", "penetration_rate"), "no unit is `on: {classes, penetration_rate}`")
     if sweep.get("rate_hz") and not units:
         yield source.at(("sweep", "rate_hz"), "the experiment has no units")
+    if sweep.get("correlation_s") and not any(_memories(data, name, "detection") for name in _names(data.get("pems"))):
+        yield source.at(("sweep", "correlation_s"), "no PEM has `memory: {detection: […]}`")
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
     counts = sweep.get("units")
     for k, count in enumerate(counts if isinstance(counts, list) else []):
@@ -148,23 +150,12 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             )
 
 
-def _fusion_of_pose(source: Source, key: Key, fusion: object, data: dict[str, Any]) -> Iterator[str]:
-    """A posterior is drawn around what is expected, anew at each instant: of errors that last it knows nothing."""
-    if not isinstance(fusion, dict) or fusion.get("combine") != "posterior":
-        return
-    if any(unit.get("placed") is not None for _, unit in _items(data.get("units"))):
-        yield source.at(
-            (*key, "fusion"), "combine: posterior draws anew at each instant and has no memory; use samples"
-        )
-
-
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
     chosen = configuration.get("units")
     if chosen == "all" and not _modelled(source.data):
         which = "modelled units; recorded ones are named" if units else "units"
         yield source.at((*key, "units"), f"all: the experiment has no {which}")
     yield from _fusion(source, key, configuration, chosen)
-    yield from _fusion_of_pose(source, key, configuration.get("fusion"), source.data)
     given: list[str] = []
     for k, unit in enumerate(chosen if isinstance(chosen, list) else []):
         if _is_name(unit) and str(unit) not in units:
@@ -182,6 +173,9 @@ def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: obj
     """What fusions other than the ideal one do not go with."""
     fusion, measure = configuration.get("fusion"), source.data.get("measure")
     kind = fusion.get("kind") if isinstance(fusion, dict) else None
+    if isinstance(fusion, dict) and fusion.get("combine") == "posterior" and _remembers(source.data, chosen):
+        message = "posterior draws anew at each instant and has no memory; use samples"
+        yield source.at((*key, "fusion", "combine"), message)
     if not isinstance(kind, str) or kind == "ideal":
         return
     if chosen == "truth":
@@ -192,6 +186,24 @@ def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: obj
             f"configuration {key[-1]!r}: {kind} has no exact times, as what it does depends on sampled errors; only "
             "ideal fusion has",
         )
+
+
+def _remembers(data: dict[str, Any], chosen: object) -> bool:
+    """Whether any draw of a configuration's units lasts, of their PEMs or of their own poses."""
+    named = map(str, chosen) if isinstance(chosen, list) else _modelled(data) if chosen == "all" else ()
+    units = dict(_items(data.get("units")))
+    heard = [units.get(name, {}) for name in named]
+    return any(unit.get("placed") is not None or _memories(data, str(unit.get("pem"))) for unit in heard)
+
+
+def _memories(data: dict[str, Any], name: str, quantity: str | None = None) -> list[dict[str, Any]]:
+    """What a PEM and its couples say of memory, of one quantity or of any."""
+    pems = data.get("pems")
+    pem = {str(key): pem for key, pem in pems.items()}.get(name) if isinstance(pems, dict) else None
+    couples = pem.get("couples") if isinstance(pem, dict) else pem
+    each = [pem, *(couples if isinstance(couples, list) else ())]
+    memories = [one["memory"] for one in each if isinstance(one, dict) and isinstance(one.get("memory"), dict)]
+    return [memory for memory in memories if memory and (quantity is None or quantity in memory)]
 
 
 def _modelled(data: dict[str, Any]) -> list[str]:

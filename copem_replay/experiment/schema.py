@@ -138,6 +138,14 @@ def _once(values: tuple[float, ...]) -> tuple[float, ...]:
     return values
 
 
+def _none_or_lasting(value: float) -> float:
+    if 0 < value < 0.001:
+        raise ValueError(f"expected 0 or at least 0.001 (s), found {value:g}")
+    return value
+
+
+Lasting = Annotated[float, Field(strict=True, ge=0, le=86_400), AfterValidator(_none_or_lasting)]
+"""A correlation time in seconds; 0: nothing lasts."""
 SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
 
 
@@ -148,6 +156,7 @@ class SweptBy(Frozen):
     rate_hz: SweptNames | None = None
     units: SweptNames | None = None
     penetration_rate: SweptNames | None = None
+    correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
 
 
 def _swept_by(value: object) -> str:
@@ -163,7 +172,8 @@ class Sweep(Frozen):
     By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
     `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
     `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
-    how many of those that may carry a unit do.
+    how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
+    every list.
     """
 
     configurations: Swept | None = None
@@ -171,13 +181,16 @@ class Sweep(Frozen):
     rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        if not (self.latency_s or self.rate_hz or self.units or self.penetration_rate):
-            raise ValueError(
-                "expected values of latency_s, rate_hz, units or penetration_rate, such as `latency_s: [0, 0.5, 1]`"
-            )
+        names = list(SweptBy.model_fields)
+        if not any(getattr(self, name) for name in names):
+            known = f"{', '.join(names[:-1])} or {names[-1]}"
+            raise ValueError(f"expected values of {known}, such as `latency_s: [0, 0.5, 1]`")
         for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
             if self.chosen(quantity) and not getattr(self, quantity):
                 raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")

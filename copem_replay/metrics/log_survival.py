@@ -1,7 +1,8 @@
 """Survival: how probably an object is still unknown after each list, in logarithms, so that no tail is lost.
 
-Lists are independent given the truth; a list holds the object with probability p. What is carried on from instant to
-instant is the logarithm of the probability that the object is not known yet, and nothing is one minus its complement.
+Lists are independent given the truth, but where detection lasts (`lasting_survival.py`); a list holds the object with
+probability p. What is carried on from instant to instant is the logarithm of the probability that the object is not
+known yet, and nothing is one minus its complement.
 Beside it goes d ln P(never) / dδ, δ being added to the log-odds of every p: how much the tail hangs on error models.
 Letters of the shapes: P lists of one object, K instants at which some arrive. Definitions: docs/measures.md.
 """
@@ -14,6 +15,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int
+from copem_replay.metrics.lasting_survival import Lasting, moved_odds
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 _HALF = 0.5
@@ -35,13 +37,16 @@ class FirstKnown:
     log_never_half: float
 
 
-def first_of(arrives_s: Float, listed: Float, unit_ix: Int, share: Float) -> FirstKnown:
+def first_of(arrives_s: Float, listed: Float, unit_ix: Int, share: Float, lasts: Lasting | None = None) -> FirstKnown:
     """When the first list holds the object; `arrives_s (P,)`, `listed (P,)` with which probability p, 0 … 1.
 
-    A unit that is there with probability q < 1, `share (U,)`, misses the object with (1 − q) + q Π (1 − p).
+    A unit that is there with probability q < 1, `share (U,)`, misses the object with (1 − q) + q Π (1 − p). `lasts`:
+    of which lists detection lasts, None: of none; then the units of one process are there in all runs.
     """
     time_s, instant = _by_instant(arrives_s)
     missed, half = _log_missed(listed, 1.0), _log_missed(listed, _HALF)
+    if lasts is not None:
+        missed, half = lasts.log_missed(listed, missed), lasts.log_missed(moved_odds(listed, _HALF), half)
     step, slope, log_half = np.zeros(len(time_s)), 0.0, 0.0
     # Who is certain to be there is one group.
     group = np.where(share[unit_ix] == 1, -1, unit_ix)
@@ -53,7 +58,12 @@ def first_of(arrives_s: Float, listed: Float, unit_ix: Int, share: Float) -> Fir
         step += _perhaps(alone, there)
         log_half += float(_perhaps(half[mine].sum(keepdims=True), there)[0])
         # Its lists can tell more only if it is there, which it hardly is when all of them have missed.
-        slope -= float(_there(alone.sum(keepdims=True), there)[0][0]) * float(listed[mine].sum())
+        still = float(_there(alone.sum(keepdims=True), there)[0][0])
+        if lasts is None:
+            slope -= still * float(listed[mine].sum())
+        else:
+            some = lasts.take(mine)
+            slope += still * (some.slope(listed[mine]) - float(listed[mine][some.process < 0].sum()))
     unknown = np.cumsum(step)
     probability = np.exp(_before(unknown)) * (0.0 - np.expm1(step))
     return _known(time_s, probability, float(unknown[-1]) if len(unknown) else 0.0, slope, log_half)

@@ -24,7 +24,6 @@ from copem_replay.perception.observation import Observations
 from copem_replay.perception.pem.classes import drawn_class, row_of
 from copem_replay.perception.pem.condition import applies
 from copem_replay.perception.pem.ghosts import Beside, Ghosts
-from copem_replay.perception.perceive import with_states
 
 if TYPE_CHECKING:
     from copem_replay.perception.config import PerceptionSetup
@@ -112,11 +111,6 @@ def ghosts_in(
                     rows = Observations(tracks, view, couple_ix, sure, sure)
                     pieces.append(GhostRows(rows, born.words[born.ghost], np.full(len(sure), n)))
     return _joined(pieces)
-
-
-def listed_ghosts(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> Tracks:
-    """The ghosts of one run with the errors of what is listed where they are."""
-    return with_states(scene, ghosts.found.tracks, ghosts.found, setup, ghost_draws(scene, ghosts, setup, run))
 
 
 def ghost_draws(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> Draws:

@@ -1,10 +1,11 @@
 """Exact detection times: their distribution in closed form, without a single draw.
 
 Lists are independent given the truth, and with ideal fusion an object is known when any list that has arrived holds it:
-P(T > t) = Π (1 − p) over all lists that have arrived by t. Confirmation by k of n is a Markov chain over the last n − 1
-capture instants where all units capture together and their lists arrive together; elsewhere it has no such form, and is
-refused. Both are worked out in metrics/log_survival.py. With the distribution of the reaction follow the probabilities
-to pass and to fail. docs/measures.md has the definitions.
+P(T > t) = Π (1 − p) over all lists that have arrived by t. Where detection lasts, lists that go by one number are not
+independent, and a filter gives the factors (metrics/lasting_survival.py). Confirmation by k of n is a Markov chain over
+the last n − 1 capture instants where all units capture together and their lists arrive together; elsewhere it has no
+such form, and is refused. Both are worked out in metrics/log_survival.py. With the distribution of the reaction follow
+the probabilities to pass and to fail. docs/measures.md has the definitions.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from copem_replay.metrics.detection.by_truth_id import capture_instants
 from copem_replay.metrics.detections_table import distances
 from copem_replay.metrics.end_reason import texts_of
 from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
+from copem_replay.pipeline.lasting_detection import check_lasting, lasting
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import by_truth, listen
 
@@ -72,12 +74,18 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     if not experiment.measure.exact:
         return
     _check_truth_ids(experiment)
-    if experiment.measure.confirm.hits == 1:
-        return
+    hits = experiment.measure.confirm.hits
     for replay in ready:
         units = replay.expanded.with_(experiment)
         for name in units.configurations:
-            _shared_instants(replay, listen(replay.measured.tracks, replay.truth, units, name), name)
+            lasts = check_lasting(units, name, hits)
+            if hits == 1 and not lasts:
+                continue
+            heard = listen(replay.measured.tracks, replay.truth, units, name)
+            if hits > 1:
+                _shared_instants(replay, heard, name)
+            else:
+                lasting(replay, units, name, heard)
 
 
 def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
@@ -90,6 +98,7 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
         np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
     )
     instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
+    lasts = None if instants is not None else lasting(replay, units, name, heard)
     arrives_s = heard.arrives_s[0, heard.frame_ix]
     by_object = np.argsort(heard.row_object_ix, kind="stable")
     first, last = (
@@ -104,7 +113,8 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
         rows = rows[counts]
         if instants is None:
             share = replay.expanded.share if configuration.units != TRUTH else np.ones(1)
-            result.append(first_of(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share))
+            of_rows = None if lasts is None else lasts.take(rows)
+            result.append(first_of(arrives_s[rows], listed[rows], heard.row_unit_ix[rows], share, of_rows))
         else:
             instant = instants[heard.frame_ix[rows]]
             result.append(confirmed(instant, arrives_s[rows], listed[rows], confirm.hits, confirm.of))

@@ -38,11 +38,20 @@ def notes_of(
         met = replay.ever_met if replayed else None
         notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
     notes += without_points(experiment)
+    notes += _remembered_in_vain(experiment)
     if experiment.measure.accuracy and not same_instants(ready):
         outages = any(replay.expanded.outages for replay in ready)
         why = "outages" if outages else "units that only some runs have"
         notes.append(f"no accuracy.parquet: {why} give each run its own instants")
     return notes
+
+
+def _remembered_in_vain(experiment: Experiment) -> Iterator[str]:
+    """Quantities that a PEM remembers and that nothing of it draws."""
+    for name, pem in experiment.pems.items():
+        for quantity in pem.in_vain():
+            what = f"a {quantity} error" if quantity in ("position", "yaw", "speed", "size") else f"{quantity} drawn"
+            yield f"pems.{name}.memory.{quantity}: no couple has {what}, nothing to remember"
 
 
 def same_instants(ready: Sequence[Replay]) -> bool:

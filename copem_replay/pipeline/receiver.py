@@ -22,10 +22,10 @@ from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, inputs, lists_without_truth
 from copem_replay.perception.claims import claims_of
-from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in, listed_ghosts
+from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.outages import without_outages
-from copem_replay.perception.perceive import draws_of, perceive
+from copem_replay.perception.perceive import draws_of, perceive, with_states
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.stated_captures import StatedCaptures, stated_captures
@@ -112,7 +112,8 @@ def seen_by_all(
         equipped = equipped[:, [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]]
     seen = perceive(world.scene, world.found, experiment, runs, states=states, equipped=equipped)
     if ghosts is not None:
-        seen = followed_by(seen, listed_ghosts(world.scene, ghosts, experiment, int(runs[0])))
+        drawn = ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
+        seen = followed_by(seen, with_states(world.scene, ghosts.found.tracks, ghosts.found, experiment, drawn))
     seen = without_outages(world.scene, seen, experiment, runs)
     if world.recorded is None:
         return seen

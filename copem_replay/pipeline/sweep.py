@@ -1,9 +1,9 @@
 """Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
 
 A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units
-themselves. Configurations that it leaves as they are, or makes equal to one before, are left out. A latency is varied
-only where there is one (above 0, or by unit) or where the configuration is named: who hears of nobody over the air has
-none.
+themselves, one of `correlation_s` what their PEMs remember. Configurations that it leaves as they are, or makes equal
+to one before, are left out. A latency is varied only where there is one (above 0, or by unit) or where the
+configuration is named: who hears of nobody over the air has none.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, SweptBy, Unit
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers
+from copem_replay.perception.pem.memory import Memory
+from copem_replay.perception.pem.model import Pem
 
-KINDS = ("latency_s", "rate_hz", "units", "penetration_rate")
+KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s")
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Point:
     @property
     def same_units(self) -> bool:
         """Whether what is prepared for the experiment serves this point, too."""
-        return self.sweep in ("latency_s", "units")
+        return self.sweep in ("latency_s", "units", "correlation_s")
 
 
 def points(experiment: Experiment) -> Iterator[Point]:
@@ -45,6 +47,7 @@ def points(experiment: Experiment) -> Iterator[Point]:
                 update={
                     "configurations": {name: c for name, curve in curves.items() if (c := curve[k]) is not None},
                     "units": _units_at(experiment.units, kind, value),
+                    "pems": _pems_at(experiment.pems, kind, value),
                     "sweep": None,
                     "measure": _measured(experiment),
                 }
@@ -124,6 +127,9 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
         return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
     if kind == "rate_hz":
         return any(unit.recorded is None for unit in units)
+    if kind == "correlation_s":
+        pems = [experiment.pems[unit.pem] for unit in units if unit.pem is not None]
+        return any(pem.memory_of(c).get("detection") for pem in pems for c in range(len(pem.couples)))
     return kind != "penetration_rate" or any(isinstance(unit.on, Carriers) for unit in units)
 
 
@@ -161,3 +167,23 @@ def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, U
             for name, unit in units.items()
         }
     return dict(units)
+
+
+def _pems_at(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]:
+    if kind != "correlation_s":
+        return dict(pems)
+
+    def at(memory: Memory) -> Memory:
+        if not memory.get("detection"):
+            return memory
+        first, *others = memory["detection"]
+        return memory | {"detection": (first.model_copy(update={"correlation_s": float(value)}), *others)}
+
+    result = {}
+    for name, pem in pems.items():
+        couples = tuple(
+            couple if couple.memory is None else couple.model_copy(update={"memory": at(couple.memory)})
+            for couple in pem.couples
+        )
+        result[name] = pem.model_copy(update={"couples": couples, "memory": at(pem.memory)})
+    return result

@@ -51,6 +51,13 @@ ALONE = tuple((f"  {name}:", f"  #{name}:") for name in ("GT", "late", "hit", "n
 """A change: only `half` is left."""
 
 
+def eighteen() -> str:
+    """Eighteen configurations beside the ground truth, each 0.1 s later than the one before; two fuse without ids."""
+    late = "".join(f"  c{k:02}: {{units: [weak], latency_s: {k / 10}}}\n" for k in range(16))
+    late += "  union: {units: [ego, weak], fusion: {kind: union}}\n  gnn: {units: [ego, weak], fusion: {kind: gnn}}\n"
+    return changed(ONE, *ALONE[1:], ("  half: {units: [weak]}\n", late))
+
+
 def drive(path: Path) -> Path:
     frames = [
         (0.1 * k, [Obj(id=1, x=1.0 * k, vx=10.0), pedestrian(2, 30.0), pedestrian(3, 30.0, 30.0)]) for k in range(51)

@@ -13,7 +13,8 @@ from scipy import stats
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.perception.ghosts import GhostRows, ghosts_in
+from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
+from copem_replay.perception.perceive import with_states
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from tests.helpers import scenes
@@ -223,12 +224,11 @@ def test_errors_of_the_couple_that_applies() -> None:
             "error": {"kind": "gaussian", "covariance_m2": [[9.0, 0], [0, 9.0]]},
         },
     ]  # fmt: skip
-    from copem_replay.perception.ghosts import listed_ghosts
-
     plan = plan_of({"in_list": 5.0, "where": FIELD}, pem={"couples": couples})
     replay = prepare(scene_of(until_s=30), plan)
     [rows] = found(plan, scene_of(until_s=30), 1)
-    listed = listed_ghosts(replay.scene, rows, replay.expanded, 0)
+    drawn = ghost_draws(replay.scene, rows, replay.expanded, 0)
+    listed = with_states(replay.scene, rows.found.tracks, rows.found, replay.expanded, drawn)
     off_m: Float = listed.x_m[0] - rows.found.tracks.x_m[0]
     near = rows.found.view.range_m < 30
     assert off_m[near].std() == pytest.approx(1.0, rel=0.15)

@@ -280,7 +280,7 @@ def test_a_posterior_has_no_memory(tmp_path: Path) -> None:
     whole = changed().replace("height_m: 5.0,", "height_m: 5.0, placed: {yaw_sigma_deg: 1},")
     whole = whole.replace("latency_s: 0.5}", "latency_s: 0.5, fusion: {kind: ideal, combine: posterior}}")
     _, found = problems(source_of(tmp_path, whole))
-    said = "configurations.coPEM.fusion: combine: posterior draws anew at each instant and has no memory; use samples"
+    said = "configurations.coPEM.fusion.combine: posterior draws anew at each instant and has no memory; use samples"
     assert [line.partition(": ")[2] for line in found] == [said]
 
 

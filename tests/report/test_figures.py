@@ -75,7 +75,8 @@ braking: {driver: {kind: constant_deceleration, a_max_mps2: 8.0, reaction: {kind
 show: null
 """
 TWO = "measure: {objects: {ids: [2]}, onset: {kind: at, time_s: 0.5}}"
-NAMES = ("runs", "curves", "distances", "latency_breakdown")
+NAMES = ("answer", "differences", "runs", "curves", "distances", "latency_breakdown")
+WITHOUT_RUNS = tuple(name for name in NAMES if name != "runs")
 
 
 def drive(path: Path) -> Path:
@@ -165,7 +166,8 @@ def events(axes: Axes) -> list[tuple[str, float]]:
 
 def points(axes: Axes) -> dict[str, np.ndarray]:
     """Distances of the points of each label."""
-    return {str(c.get_label()): np.asarray(c.get_offsets())[:, 0] for c in axes.collections if len(c.get_offsets())}
+    drawn = [c for c in axes.collections if len(c.get_offsets()) and not str(c.get_label()).startswith("_")]
+    return {str(c.get_label()): np.asarray(c.get_offsets())[:, 0] for c in drawn}
 
 
 def note(figure: Figure) -> str:
@@ -186,7 +188,7 @@ class TestCommand:
         monkeypatch.setitem(matplotlib.rcParams, "font.size", 20.0)  # whatever the user likes
         monkeypatch.setenv("SOURCE_DATE_EPOCH", "1")
         second, _ = write_figures(load_results(results.folder), tmp_path / "b")
-        assert len(first) == 8
+        assert len(first) == 2 * len(NAMES)
         assert {p.name: p.read_bytes() for p in first} == {p.name: p.read_bytes() for p in second}
         for path in first:
             content = path.read_bytes()
@@ -228,9 +230,9 @@ class TestCommand:
         assert said in text
         # Nor does an old one stay, of a log that is no more.
         assert [Path(out).name for out in ended.out] == [
-            f"{name}.{kind}" for name in NAMES[1:] for kind in ("png", "svg")
+            f"{name}.{kind}" for name in WITHOUT_RUNS for kind in ("png", "svg")
         ]
-        assert {p.stem for p in (mine / "figures").iterdir()} == set(NAMES[1:])
+        assert {p.stem for p in (mine / "figures").iterdir()} == set(WITHOUT_RUNS)
 
     @pytest.mark.parametrize(
         ("options", "said"),
@@ -376,16 +378,18 @@ class TestRuns:
         assert line(columns[2][1], "hits")[1] == pytest.approx([0], abs=1e-6)
 
     def test_without_a_conflict(self, results: Results) -> None:
-        # The other stands 30 m aside: nearest where the ego passes, 30 − 1 − 0.3 m, 2.5 s after the onset.
+        """One course for all, with a mark where each detects: the other stands 30 m aside and nothing brakes."""
         figure = runs_figure(results, object_id="3", configurations=["late", "never"])
-        speed, gap = (figure.axes[k] for k in (0, 2))
-        assert speed.get_title(loc="left") == "late\nknown after 0.5 s, no conflict"
-        assert [label for label, _ in events(speed)] == ["clock starts", "captured", "list arrives", "nearest: 28.7 m"]
-        assert [label for label, _ in events(figure.axes[1])] == ["clock starts", "nearest: 28.7 m", "log ends"]
+        known, speed, gap, share = figure.axes
+        assert [text.get_text() for text in known.get_yticklabels()] == ["late", "never"]
+        assert points(known) == {"late": pytest.approx([0.5])}
+        assert [text.get_text() for text in known.texts] == ["0.5 s", "never known"]
+        # Nearest where the ego passes, 30 − 1 − 0.3 m, 2.5 s after the onset; the log ends after 4.5 s.
         assert at(gap, "as recorded", 2.5) == pytest.approx(28.7)
         x, y = line(speed, "as recorded")
-        assert set(np.round(y[(x >= -0.4) & (x <= 4.5)], 9)) == {10.0}
-        assert np.isnan(y[x > 4.51]).all()  # the log has ended
+        assert set(np.round(y[(x >= -0.3) & (x <= 4.49)], 9)) == {10.0}
+        assert np.isnan(y[x > 4.51]).all()
+        assert set(line(share, "visible share")[1]) == {1.0}
 
     def test_without_braking(self, tmp_path: Path) -> None:
         text = changed("braking:", "configurations: {GT: {units: truth}, PEM: {units: [ego]}}", text=TEXT)
@@ -393,9 +397,8 @@ class TestRuns:
             row for row in text.splitlines() if not row.startswith("  ") or "probab" in row or "on: ego" in row
         )
         figure = runs_figure(load_results(replayed(tmp_path, text)))
-        assert figure.axes[1].get_title(loc="left") == "GT\nknown after 0 s"
-        assert events(figure.axes[1])[-1] == ("nearest: 0.0 m", 2.3)
-        assert figure.axes[3].get_lines()[0].get_label() == "as recorded"
+        assert points(figure.axes[0]) == {"GT": pytest.approx([0.0]), "PEM": pytest.approx([0.0])}
+        assert [text.get_text() for text in figure.axes[0].texts] == ["0 s", "0 s"]
         assert "declared driver" not in note(figure)
 
     def test_labels_have_room(self) -> None:
@@ -618,7 +621,7 @@ class TestSweeps:
         ended = call(swept.folder)
         assert [Path(out).name for out in ended.out[-2:]] == ["sweeps.png", "sweeps.svg"]
         ended = call(swept.folder, "--configurations", "never")
-        assert (ended.code, len(ended.out)) == (0, 6)
+        assert (ended.code, len(ended.out)) == (0, 10)
         assert ended.lines == [
             "note: no figure of latency_breakdown: nothing was detected",
             f"note: no figure of sweeps: {swept.folder}/sweep.csv has no rows of never",
@@ -684,7 +687,7 @@ class TestWords:
         text = changed("runs: 1").replace("  late:", '  "$a$_{<&>}":').replace("  hit:", '  "_試":')
         results = load_results(replayed(tmp_path, text))
         files, notes = write_figures(results)
-        assert (len(files), notes) == (8, [])
+        assert (len(files), notes) == (2 * len(NAMES), [])
         labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]
 
@@ -692,9 +695,7 @@ class TestWords:
         looks = appearances([f"c{k}" for k in range(9)])
         assert len({(look.dashes, look.colour) for look in looks.values()}) == 9
         assert len({look.dashes for look in list(looks.values())[:7]}) == 7
-        # The yellow alone needs an outline, of the first seven; and the first line is the widest.
-        outlined = [name for name, look in looks.items() if look.edge != look.colour]
-        assert outlined[:1] == ["c3"]
+        # The first line is the widest.
         widths = [look.width_pt for look in looks.values()]
         assert widths == sorted(widths, reverse=True)
 

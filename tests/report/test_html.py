@@ -10,6 +10,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,6 @@ from matplotlib.figure import Figure
 
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.metrics.summary_text import summary_text
 from copem_replay.report import write_report
 from copem_replay.report.figures import FIGURES, FigureKind, Selection, load_results, write_figures
 from copem_replay.report.figures.latency_breakdown import (
@@ -36,7 +36,7 @@ from copem_replay.report.html.markup import Html, tag
 from copem_replay.report.html.missed_objects import misses, powers
 from copem_replay.report.html.page import page
 from copem_replay.report.html.study import load_study
-from copem_replay.results.compare import compare, comparison_text
+from copem_replay.results.compare import compare
 from copem_replay.results.read import Results
 from tests.helpers.report_pages import ALONE, EVERY, ONE, Page, changed, drive, replayed
 
@@ -108,46 +108,82 @@ class TestNumbers:
                         assert (cell.low or "") == rows[name][f"{column}_low"]
                         assert (cell.high or "") == rows[name][f"{column}_high"]
                     checked += 1
-        assert checked == len(NAMES) * (8 + 2 + 11)
+        assert checked == len(NAMES) * (6 + 1 + 11)
 
-    def test_cells_read_as_in_the_terminal(self, read: Page, made: Path) -> None:
-        summary = load_results(made).summary.astype({"list_rate_hz": float})
-        printed = [re.split(r"\s{2,}", line) for line in summary_text(summary).splitlines()]
+    def test_cells_have_three_digits_and_shares_are_in_per_cent(self, read: Page, made: Path) -> None:
+        rows = summary_rows(made)
+
+        def plainly(column: str, text: str) -> str:
+            """By Decimal, and so not as the report does it."""
+            if not text:
+                return "–"
+            value = Decimal(text) * (100 if column.endswith("_share") else 1)
+            if abs(value) >= 1000:
+                return str(int(value.to_integral_value()))
+            short = round(value, 2 - value.adjusted()) if value else value
+            return format(short.normalize(), "f").replace("-", "−") if short else "0"
+
         seen = 0
-        for id_, first in (
-            ("summary", 0),
-            ("braking", next(k for k, row in enumerate(printed) if "n_conflict" in row)),
-        ):
-            head = printed[first]
-            for line in printed[first + 1 : first + 1 + len(NAMES)]:
-                terminal = dict(zip(head, line, strict=True))
-                for column, cell in read.tables[id_][terminal["configuration"]].items():
-                    expected = terminal[column]
-                    if column in ("detected_share", "pass_share"):
-                        expected += f" {terminal['95 %']}".removesuffix(" –")
-                    assert cell.text == expected, (terminal["configuration"], column)
+        for id_ in ("summary", "braking", "accuracy", "lists"):
+            for name, cells in read.tables[id_].items():
+                for column, cell in cells.items():
+                    expected = plainly(column, rows[name][column])
+                    if column in ("detected_share", "pass_share") and rows[name][f"{column}_low"]:
+                        limits = [plainly(column, rows[name][f"{column}_{end}"]) for end in ("low", "high")]
+                        expected += f" [{', '.join(limits)}]"
+                    assert cell.text == expected, (name, column)
                     seen += 1
-        assert seen == len(NAMES) * 10
+        assert seen == len(NAMES) * 18
+
+    def test_columns_that_are_the_same_for_all_are_said_once(self, read: Page) -> None:
+        assert "6 rows, 10 fused lists per second for each configuration.\n" in read.words
+        assert "6 rows in conflict for each configuration.\n" in read.words
+        assert not {"n", "list_rate_hz", "n_conflict"} & {
+            name for t in read.tables.values() for name in t.get("GT", {})
+        }
+
+    def test_times_come_first_and_headers_have_units(self, read: Page) -> None:
+        assert read.rows["summary"][0] == [
+            "configuration", "mean time to detection, s", "median time to detection, s", "95 % detected by, s",
+            "detected, %", "median distance at detection, m", "95 % detected beyond, m",
+        ]  # fmt: skip
+        assert read.rows["regret"][0][1:3] == ["mean time to detection, s", "detected, percentage points"]
+        assert read.rows["regret-lists"][0][1:] == [
+            "position error (RMSE), m",
+            "GOSPA, m",
+            "false positives per minute",
+        ]
 
     def test_the_regret_is_that_of_compare(self, read: Page, made: Path) -> None:
-        comparison = compare([made], baseline="late")
-        printed = [re.split(r"\s{2,}", line) for line in comparison_text(comparison).splitlines()]
-        assert list(read.tables["regret"]) == [row[0] for row in printed[1:5]] == ["GT", "half", "hit", "never"]
-        for line in printed[1:5]:
-            for metric, expected in zip(printed[0][1:], line[1:], strict=True):
-                cell = read.tables["regret"][line[0]][metric]
-                assert cell.text == expected
-                row = comparison.overall.set_index(["configuration", "metric"]).loc[(line[0], metric)]
-                for found, wanted in ((cell.value, row.difference), (cell.low, row.low), (cell.high, row.high)):
-                    assert (found is None) == pd.isna(wanted)
-                    assert found is None or float(found) == pytest.approx(wanted, rel=1e-8, abs=1e-12)
+        rows = compare([made], baseline="late").overall.set_index(["configuration", "metric"])
+        seen = 0
+        for id_ in ("regret", "regret-lists"):
+            assert list(read.tables[id_]) == ["GT", "half", "hit", "never"]
+            for name, cells in read.tables[id_].items():
+                for metric, cell in cells.items():
+                    row = rows.loc[(name, metric)]
+                    for found, wanted in ((cell.value, row.difference), (cell.low, row.low), (cell.high, row.high)):
+                        assert (found is None) == pd.isna(wanted)
+                        assert found is None or float(found) == pytest.approx(wanted, rel=1e-8, abs=1e-12)
+                    seen += 1
+        assert seen == len(rows)
+
+    def test_differences_whose_interval_excludes_0_are_bold(self, read: Page, html: str) -> None:
+        for id_ in ("regret", "regret-lists"):
+            for name, cells in read.tables[id_].items():
+                row = re.search(rf'<table id="{id_}">.*?<tr data-row="{name}">(.*?)</tr>', html, re.DOTALL)
+                assert row is not None
+                for column, cell in cells.items():
+                    bold = re.search(rf'data-column="{column}"[^>]*><b>', row[1]) is not None
+                    sure = cell.low is not None and cell.high is not None and float(cell.low) * float(cell.high) > 0
+                    assert bold == sure, (name, column)
 
     def test_every_column_shown_is_explained(self, read: Page) -> None:
-        shown = {
-            name for id_ in ("summary", "braking", "accuracy", "lists", "regret") for name in read.rows[id_][0][1:]
-        }
-        terms = re.findall(r"<dt><code>(.*?)</code></dt><dd>(.+?)</dd>", read.html)
-        assert shown == {name for name, _ in terms}
+        tables = ("summary", "braking", "accuracy", "lists", "regret", "regret-lists")
+        shown = {name for id_ in tables for name in read.rows[id_][0][1:]}
+        terms = re.findall(r"<dt>([^<]*?)</dt><dd>(.+?) <code>(\w+)</code></dd>", read.html)
+        assert shown == {name for name, _, _ in terms}
+        assert {name for id_ in tables for name in read.tables[id_]["GT"]} == {column for _, _, column in terms}
 
     def test_provenance_is_all_there(self, read: Page, made: Path) -> None:
         data = json.loads((made / "provenance.json").read_text(encoding="utf-8"))
@@ -173,58 +209,55 @@ class TestWords:
         lines = lines_of(made)
         mean_s = float(summary_rows(made)["half"]["ttd_rmst_s"])
         assert lines[2] == (
-            f"half knew soonest, after {mean_s:.4g} s on the average (never detected counting as 4.5 s), sooner "
-            "than the other 3."
+            f"half detects soonest, after {mean_s:.3g} s on average (an object that is never detected counts as "
+            "4.5 s), sooner than the other 3."
         )
         difference = 0.5 - mean_s
-        assert lines[3].startswith(
-            f"Later than that, the interval of the difference excluding 0: late (+{difference:.3g} s ["
-        )
+        assert lines[3].startswith(f"Later, the interval of the difference excluding 0: late (+{difference:.3g} s [")
         assert lines[3].index("hit (") < lines[3].index("never (")
-        assert "The winner was picked by these same figures, which flatters it a little." in lines
-        assert "Never knew of anybody: never." in lines
+        assert "The same figures pick the winner, which flatters it a little." in lines
+        assert "never never detects any object." in lines
         assert any(
             line.startswith("Braking: of 6 rows in conflict 100 % [") and "pass with late, half" in line
             for line in lines
         )
-        assert any(line.startswith("GT: the truth itself") for line in lines)
+        assert "GT is the ground truth: the upper bound, not ranked." in lines
         assert any("over runs" in line and "do not tell about other traffic" in line for line in lines)
 
     def test_without_intervals_it_says_so(self, tmp_path: Path) -> None:
         lines = lines_of(replayed(tmp_path, changed()))
         assert re.fullmatch(
-            r"2 objects, so no interval\. half has the shortest mean time, \S+ s "
-            r"\(never detected counting as 4\.5 s\)\.",
+            r"No interval: 2 objects\. half has the shortest mean time, \S+ s "
+            r"\(an object that is never detected counts as 4\.5 s\)\.",
             lines[2],
         )
-        assert lines[3].startswith("After it, by differences without an interval: late (+")
+        assert lines[3].startswith("Later, without an interval: late (+")
         assert "[" not in lines[3]
-        assert any(
-            line.startswith("How sure: there are no intervals, for there are fewer than 5 logs") for line in lines
-        )
+        assert any(line.startswith("There are no intervals: there are fewer than 5 logs") for line in lines)
         assert not any("excluding 0" in line for line in lines)
 
     def test_who_is_alike_is_no_winner(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])
         lines = lines_of(replayed(tmp_path, text))
-        assert lines[2].startswith("half and hit knew at the very same times: after ")
-        assert not any("No difference" in line or "cannot be told" in line for line in lines)
-        assert "The winners were picked by these same figures, which flatters them a little." not in lines, "no loser"
+        assert re.match(r"(No interval.*\. )?half and hit detect at the same times: after ", lines[2])
+        assert not any("No difference" in line or "includes 0" in line for line in lines)
+        assert "The same figures pick the winners, which flatters them a little." not in lines, "no loser"
 
     def test_who_knows_at_once_ties(self, tmp_path: Path) -> None:
         """Of units that surely see both objects at the onset none is the first; of two objects there is no interval."""
         second = ("  hit: {units: [ego], latency_s: 1.8}", "  second: {units: [ego]}")
         lines = lines_of(replayed(tmp_path, changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second)))
-        assert lines[2] == "half and second knew at once; 2 objects, so no interval. The other 2 are below."
-        assert re.match(
-            r"After it, by differences without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[3]
+        assert (
+            lines[2]
+            == "No interval: 2 objects. half and second detect every object at its onset. The other 2 are below."
         )
+        assert re.match(r"Later, without an interval: late \(\+0\.5 s\), never \(\+4\.5 s\)\.", lines[3])
         assert not any("shortest" in line or "soonest" in line for line in lines)
         three = ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [ego]}")
         text = changed(("  half: {units: [weak]}", "  half: {units: [ego]}"), second, three, ALONE[3])
         lines = lines_of(replayed(tmp_path / "all", text))
-        assert lines[2] == "late, half and second knew at once; 2 objects, so no interval."
-        assert not lines[3].startswith("After it")
+        assert lines[2] == "No interval: 2 objects. late, half and second detect every object at its onset."
+        assert not lines[3].startswith("Later")
 
     def test_the_same_mean_at_other_times_is_a_tie_too(self, tmp_path: Path) -> None:
         """One unit sees only the one object, the other only the other: at once and never, whichever it is."""
@@ -238,8 +271,8 @@ class TestWords:
         )  # fmt: skip
         lines = lines_of(replayed(tmp_path, text))
         assert lines[2] == (
-            "2 objects, so no interval. hit and half have the same mean time, 0.05 s (never detected counting as 0.1 "
-            "s), though they did not always know at the same time."
+            "No interval: 2 objects. hit and half have the same mean time, 0.05 s (an object that is never detected "
+            "counts as 0.1 s), though they do not always detect at the same time."
         )
 
     def test_of_equal_lists_none_is_the_best(self, tmp_path: Path) -> None:
@@ -250,12 +283,12 @@ class TestWords:
         lines = lines_of(replayed(tmp_path, text))
         [best] = [line for line in lines if line.startswith("The best lists")]
         assert re.match(
-            r"The best lists, places, misses and false entries taken together, by means without an interval, had half "
-            r"and second: GOSPA 0 m, against \S+ m with late and never\.",
+            r"The best lists are those of half and second, by means without an interval: GOSPA \(positions, misses and "
+            r"false positives in one number\) of 0 m, against \S+ m with late and never\.",
             best,
         )
         [braking] = [line for line in lines if line.startswith("Braking")]
-        assert any(line.startswith("After it, by differences without an interval: ") for line in lines)
+        assert any(line.startswith("Later, without an interval: ") for line in lines)
         assert "pass with half, second, 0 % [" in braking
         assert "with late, never" in braking
 
@@ -264,11 +297,9 @@ class TestWords:
         other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
         hit = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}")
         lines = lines_of(replayed(tmp_path, changed(ONE, other, hit, *ALONE[:2], ALONE[3])))
-        assert re.search(r", but cannot be told from (hit|half)\.$", lines[2])
-        assert re.match(
-            r"No difference to it can be shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3]
-        )
-        assert lines[3].endswith("]). That is not to say that there is none.")
+        assert re.search(r", but the interval of its difference to (hit|half) includes 0\.$", lines[2])
+        assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3])
+        assert lines[3].endswith("]). That does not show that there is none.")
 
     @pytest.mark.parametrize(
         ("low", "high", "includes"), [(-1.0, 0.0, True), (0.0, 1.0, True), (-1.0, -1e-3, False), (1e-3, 1.0, False)]
@@ -280,7 +311,7 @@ class TestWords:
         mine = (table["metric"] == "ttd_rmst_s") & (table["configuration"] == study.best)
         table.loc[mine, ["low", "high"]] = [low, high]
         changed_one = replace(study, regret=replace(study.regret, table=table))
-        (line,) = [line for line in Page(page(changed_one)).lines() if line.startswith("half against GT, the baseline")]
+        (line,) = [line for line in Page(page(changed_one)).lines() if line.startswith("half minus GT, the baseline")]
         assert ("the interval includes 0, so no difference can be shown" in line) == includes
 
     def test_one_configuration_is_compared_with_nothing(self, tmp_path: Path) -> None:
@@ -295,7 +326,7 @@ class TestWords:
 
     def test_beside_the_truth_alone_nobody_competes(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed(ONE, *ALONE[1:]))
-        assert lines_of(folder)[2].endswith("There is nothing to compare it with: only the truth stands beside it.")
+        assert lines_of(folder)[2].endswith("There is nothing to compare it with: only the ground truth is beside it.")
         study = load_study(folder)
         assert (study.baseline, study.best, study.lead) == ("half", "half", None)
         assert study.regret is not None
@@ -305,9 +336,7 @@ class TestWords:
         text = changed(ONE, ("  late: {units: [ego], latency_s: 0.5}", "  late: {units: [eye]}"), *ALONE[:1], ALONE[2])
         text = text.replace("  half: {units: [weak]}", "  half: {units: [eye]}")
         found = Page(page(load_study(replayed(tmp_path, text))))
-        assert found.lines()[2] == (
-            "Nothing was detected: no configuration came to know of any measured object in any run."
-        )
+        assert found.lines()[2] == ("No configuration detects any measured object in any run.")
         assert not any("soonest" in line or "shortest" in line for line in found.lines())
         assert "No figure: nothing was detected." in found.words
         assert found.rows["never"][1][:5] == ["drive", "2", "pedestrian", "6 runs (all)", "all 3 configurations"]
@@ -315,16 +344,16 @@ class TestWords:
     def test_nobody_measured_is_no_answer(self, tmp_path: Path) -> None:
         folder = replayed(tmp_path, changed((EVERY, "measure: {objects: {classes: [animal]}, onset")))
         found = Page(page(load_study(folder)))
-        assert found.lines()[2] == "There is no answer: no measured object has an onset, so nobody was measured."
+        assert found.lines()[2] == "There is no answer: no measured object has an onset."
         assert any(line.startswith("drive: no rows: nothing to measure") for line in found.lines())
-        assert "No differences: nobody was measured." in found.words
+        assert "No differences: no object is measured." in found.words
         assert found.plots == []
-        assert next(cell.text for cell in found.tables["summary"]["GT"].values()) == "0"
+        assert "0 rows" in found.words
 
     def test_the_baseline_is_ideal_else_the_first_else_as_asked(self, made: Path, tmp_path: Path) -> None:
         assert load_study(made).baseline == "late"
         assert load_study(made, "hit").baseline == "hit"
-        assert "None is named ideal, so this is the first" in page(load_study(made))
+        assert "No configuration is named ideal, so this is the first" in page(load_study(made))
         with pytest.raises(InputError, match="no configuration is named 'hti'"):
             load_study(made, "hti")
         named = replayed(tmp_path, changed(ONE, ("  hit:", "  ideal:")))
@@ -458,12 +487,12 @@ class TestWaterfall:
         folder = replayed(tmp_path, changed(("time_s: 0.5}}", "time_s: 0.5}, count_earlier: true}")))
         found = Page(page(load_study(folder)))
         assert "No figure: with count_earlier" in found.words
-        assert found.plots == ["curves", "distances"]
+        assert found.plots == ["answer", "differences", "curves", "distances"]
 
 
 class TestFigures:
     def test_each_that_needs_no_recording(self, read: Page, tmp_path: Path) -> None:
-        assert read.plots == ["curves", "distances", "latency_breakdown"]
+        assert read.plots == ["answer", "differences", "curves", "distances", "latency_breakdown"]
         text = changed(ONE, *ALONE[2:]) + "sweep: {latency_s: [0, 0.5], rate_hz: [2, 10]}\n"
         assert Page(page(load_study(replayed(tmp_path, text)))).plots == [*read.plots, "sweeps"]
 
@@ -549,7 +578,7 @@ class TestFile:
                 assert key != "style" or "url(" not in (value or "").replace("url(#", ""), (name, value)
                 assert key != "xlink:href" or (value or "").startswith("#"), (name, value)
                 assert not key.startswith("on"), (name, key)
-                assert key != "href" or value == "data:,", (name, value)
+                assert key != "href" or value == "data:," or (value or "").startswith("#"), (name, value)
         (policy,) = [found["content"] for _, found in read.elements if found.get("http-equiv")]
         assert policy is not None
         assert policy.startswith("default-src 'none';")
@@ -557,6 +586,9 @@ class TestFile:
         style = re.search(r"<style>(.*?)</style>", read.html, re.DOTALL)
         assert style is not None
         assert "url(" not in style[1]
+        assert {given["href"] for name, given in read.elements if name == "a"} <= {
+            f"#{given['id']}" for _, given in read.elements if "id" in given
+        }
         assert "@import" not in style[1]
 
     def test_names_are_shown_and_do_nothing(self, tmp_path: Path) -> None:

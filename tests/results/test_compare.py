@@ -11,8 +11,10 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
+from copem_replay.core.errors import InputError
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
 from copem_replay.results.compare import Comparison, compare
+from copem_replay.results.read import open_results
 from tests.helpers.compare_folders import BRAKING, Row, limits_of, row, write_folder
 
 
@@ -350,3 +352,14 @@ def test_of_a_detection_and_a_censoring_at_one_time_the_detection_comes_first(tm
     rows += [row(name, None, object_id="8", **censored) for name in ("ideal", "late")]
     time = of(compared(tmp_path, rows, measure={"horizon_s": 1.0}), "ttd_rmst_s")
     assert time["value"] == pytest.approx(0.2 + 0.5 * 0.8)
+
+
+def test_some_metrics_are_those_of_all_and_an_open_folder_is_as_its_path(tmp_path):
+    folder = write_folder(tmp_path / "study", random_rows(["ideal", "late", "later"]))
+    every = compare([folder]).table
+    some = compare([open_results(folder)], metrics=("dad_median_m", "ttd_rmst_s")).table
+    expected = every[every["metric"].isin(["dad_median_m", "ttd_rmst_s"])].reset_index(drop=True)
+    assert set(every["metric"]) > set(some["metric"])
+    pd.testing.assert_frame_equal(some, expected)
+    with pytest.raises(InputError, match="expected each folder once, found it twice"):
+        compare([open_results(folder), folder])

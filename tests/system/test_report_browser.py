@@ -1,30 +1,20 @@
-"""Reports opened in headless Chromium, as a reader has them: all figures drawn, nothing asked of a network, no error.
-
-Needs Chromium and its driver on the PATH (Debian: chromium, chromium-driver); skipped without.
-"""
+"""Reports opened in headless Chromium, as readers have them: all figures drawn, no network asked, no error."""
 
 from __future__ import annotations
 
 import base64
 import csv
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from copem_replay.report import write_report
+from tests.helpers.browser import Browser, opened_browser
 from tests.helpers.report_pages import ONE, changed, replayed
 
-selenium = pytest.importorskip("selenium", reason="needs selenium, which `pip install .[dev]` brings")
-
 NAMES = ["GT", "<img src=x onerror=alert(1)>", "half", "hit", "never"]
-OPTIONS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--window-size=1280,900",
-)  # fmt: skip
 SIZES = """
 return [...document.querySelectorAll(".plot")].map((plot) => {
   const svg = plot.querySelector("svg");
@@ -35,57 +25,10 @@ return [...document.querySelectorAll(".plot")].map((plot) => {
 """
 
 
-class Browser:
-    """A page in a browser, and what the browser said of it."""
-
-    def __init__(self, driver: Any) -> None:
-        self.driver = driver
-        self.run = driver.execute_script
-
-    def open(self, page: Path) -> None:
-        from selenium.webdriver.support.ui import WebDriverWait
-
-        self.driver.get(page.as_uri())
-        WebDriverWait(self.driver, 120).until(lambda _: self.run("return document.documentElement.dataset.drawn"))
-
-    def narrow(self, width: int) -> None:
-        """As a phone shows it."""
-        size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-
-    def said(self) -> list[str]:
-        """What is on the console: errors, warnings, what was refused."""
-        return [entry["message"] for entry in self.driver.get_log("browser")]
-
-    def asked_for(self, page: Path) -> set[str]:
-        """Addresses that the page asked for, but itself and what it holds in itself."""
-        found = set()
-        for entry in self.driver.get_log("performance"):
-            message = json.loads(entry["message"])["message"]
-            if message["method"] == "Network.requestWillBeSent":
-                asked = message["params"]
-                url = asked["request"]["url"]
-                if asked.get("documentURL") == page.as_uri() and not url.startswith(("data:", "blob:")):
-                    found.add(url)
-        return found - {page.as_uri()}
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        pytest.skip("needs chromium and chromedriver on the PATH, found none; apt-get install chromium chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for option in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('user')}"):
-        options.add_argument(option)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    opened = webdriver.Chrome(options=options, service=Service(driver))
-    yield Browser(opened)
-    opened.quit()
+    with opened_browser(tmp_path_factory.mktemp("user")) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +60,14 @@ def opened(once: Browser, report: Path) -> Iterator[Browser]:
 
 def test_every_figure_is_drawn_and_nothing_goes_wrong(opened: Browser, report: Path) -> None:
     found = opened.run(SIZES)
-    assert [one["id"] for one in found] == ["curves", "distances", "latency_breakdown", "sweeps"]
+    assert [one["id"] for one in found] == [
+        "answer",
+        "differences",
+        "curves",
+        "distances",
+        "latency_breakdown",
+        "sweeps",
+    ]
     for one in found:
         assert one["width"] > 200, one
         assert one["height"] > 100, one
@@ -136,7 +86,7 @@ def test_the_summary_has_the_numbers_of_the_file(opened: Browser, folder: Path) 
         rows = list(csv.DictReader(file))
     assert [name for name, _ in shown] == [row["configuration"] for row in rows] == NAMES
     for (_, cells), row in zip(shown, rows, strict=True):
-        assert len(cells) == 8
+        assert len(cells) == 6
         assert cells == {name: row[name] for name in cells}
 
 
@@ -158,6 +108,7 @@ def test_a_configuration_can_be_left_out(opened: Browser) -> None:
 
     before = shown()
     assert before >= {(name, k) for name in ("curves", "distances", "latency_breakdown") for k in range(5)}
+    assert before >= {("answer", k) for k in range(1, 5)}, "the ground truth is a line of all"
     press('data-configuration="2"')
     assert shown() == {(name, k) for name, k in before if k != 2}
     press('data-every="none"')
@@ -174,6 +125,58 @@ def test_on_a_phone_only_tables_and_figures_scroll_sideways(opened: Browser) -> 
     tables = '[...document.querySelectorAll(".scroll:not(.figure)")]'
     wide = opened.run(f"return {tables}.filter((s) => s.scrollWidth > s.clientWidth).length")
     assert wide > 0, "a table wider than the page is there to be scrolled"
+
+
+def test_on_a_phone_the_name_stays_and_times_come_first(opened: Browser) -> None:
+    opened.narrow(390)
+    first, column = opened.run(
+        """const scroll = document.querySelector("#summary").closest(".scroll");
+        scroll.scrollLeft = 0;
+        const times = scroll.querySelector("tbody td").getBoundingClientRect();
+        scroll.scrollLeft = scroll.scrollWidth;
+        const name = scroll.querySelector("tbody th").getBoundingClientRect();
+        const cell = scroll.querySelector("tbody td");
+        const found = [[cell.dataset.column, times.right], name.left];
+        scroll.scrollLeft = 0;
+        return found;"""
+    )
+    assert first[0] == "ttd_rmst_s"
+    assert first[1] <= 390, "seen without scrolling"
+    assert 0 <= column <= 20, "at the left edge though the table is scrolled"
+
+
+def test_a_dark_page_has_dark_paper_and_light_letters_in_figures_too(opened: Browser) -> None:
+    lightness = """
+      const level = (colour) => colour.match(/\\d+/g).slice(0, 3).map(Number).reduce((a, b) => a + b) / 765;
+      const style = (element) => getComputedStyle(element);
+      const label = document.querySelector("#answer [id*='-ytick_'] use, #answer [id*='-ytick_'] path");
+      const paper = document.querySelector("#answer [id$='-patch_1'] path");
+      return [level(style(document.body).backgroundColor), level(style(document.body).color),
+              level(style(label).fill), level(style(paper).fill)];"""
+    opened.scheme("dark")
+    paper, ink, label, figure = opened.run(lightness)
+    assert paper < 0.2 < 0.8 < min(ink, label)
+    assert figure == pytest.approx(paper, abs=0.01)
+    dot = """const third = document.querySelectorAll("#answer [id*='configuration-2-']");
+      return [...third].flatMap((g) => [...g.querySelectorAll("use, path")]).map((e) => getComputedStyle(e).fill)"""
+    dark = opened.run(dot)
+    opened.scheme("light")
+    paper, ink, label, figure = opened.run(lightness)
+    assert max(ink, label) < 0.2 < 0.99 < paper
+    assert figure == pytest.approx(paper, abs=0.01)
+    assert "rgb(0, 158, 115)" in opened.run(dot), "the third colour of the palette"
+    assert "rgb(0, 158, 115)" in dark, "a configuration keeps its colour"
+    opened.scheme("")
+
+
+def test_the_contents_lead_to_every_section(opened: Browser) -> None:
+    titles, links = opened.run(
+        """const title = (a) => document.querySelector(a.getAttribute("href") + " > h2").textContent;
+        return [[...document.querySelectorAll("main > section > h2")].map((h) => h.textContent),
+                [...document.querySelectorAll("nav a")].map(title)]"""
+    )
+    assert titles == links
+    assert titles[0] == "Differences"
 
 
 def test_on_a_phone_figures_are_scrolled(browser: Browser, report: Path) -> None:

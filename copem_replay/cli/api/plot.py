@@ -92,7 +92,7 @@ def write_figures(
 
     >>> files, notes = cr.plot.write_figures("out/tc016d", "figures", configurations=["GT", "PEM"])
     >>> sorted({file.stem for file in files})
-    ['curves', 'distances', 'latency_breakdown', 'runs']
+    ['answer', 'curves', 'differences', 'distances', 'latency_breakdown', 'runs']
     """
     from copem_replay.report.figures import write_figures as write
 

@@ -90,8 +90,8 @@ class Ghosts(Frozen):
     """One sort of ghosts: `in_list` of them in a list on average (Poisson), each for `lasts_s` (exponential).
 
     Both are the same at any list rate. `lasts_s: 0`: others in every list. `beside`: so many of each such object.
-    `classes`: what they are listed as, pedestrians where nothing is said (chosen: what is not classified is no ghost where
-    nobody asks for such). `existence`: what the unit claims of it, left out: as the couple that applies.
+    `classes`: what they are listed as, pedestrians where nothing is said (chosen: `other` counts as false only where
+    such objects are measured). `existence`: what the unit claims of it, left out: as the couple that applies.
     """
 
     in_list: Annotated[float, Field(strict=True, ge=0, le=1000)]

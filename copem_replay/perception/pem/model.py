@@ -73,8 +73,12 @@ class Pem(Frozen):
     @property
     def draws_claims(self) -> bool:
         """Whether what entries say beside their states, or which entries there are about nobody, is drawn."""
-        scores = any(isinstance(couple.existence, Scores) for couple in self.couples)
-        return scores or bool(self.ghosts) or self.classes is not None or self.tracks is not None
+        return self._scores or bool(self.ghosts) or self.classes is not None or self.tracks is not None
+
+    @property
+    def _scores(self) -> bool:
+        said = [*(couple.existence for couple in self.couples), *(sort.existence for sort in self.ghosts)]
+        return any(isinstance(one, Scores) for one in said)
 
     @property
     def ghosts_in_list(self) -> float:
@@ -89,6 +93,9 @@ class Pem(Frozen):
     def in_vain(self) -> Iterator[str]:
         """Quantities that are remembered and that no couple draws."""
         asked = self.asked()
+        drawn = {"detection", *(asked or ())}
+        drawn |= {"class"} if self.classes is not None and self.classes.confusion else set()
+        drawn |= {"existence"} if self._scores else set()
         for name in self.memory if asked is not None else ():
-            if name not in ("detection", *(asked or ())):
+            if name not in drawn:
                 yield name

@@ -18,6 +18,8 @@ from copem_replay.metrics.survival import CENSORED, DETECTED
 
 RESAMPLES = 400
 """Of a band (chosen: its limits are then off by about 1 % of what lies between them)."""
+_SAME_S = 1e-9
+"""Means this close are the same (chosen: times are whole nanoseconds)."""
 _CELLS = 4_000_000
 """Resamples × rows held at a time (chosen: 32 MB a column)."""
 
@@ -74,3 +76,34 @@ def resampled_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> 
         shares = summed[:, np.searchsorted(time_s, at_s, side="right")] / total
     result: Float = np.minimum(shares, 1.0)
     return result
+
+
+def mean_limits(
+    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int, *, confidence: float = 0.95
+) -> tuple[float, float] | None:
+    """Limits of the restricted mean of times (n,) at a horizon; None: every resample has the same mean.
+
+    Columns as of `band`. The same resamples as those of a share in `summary.csv`.
+    """
+    names, of = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
+    resampled = resamples([str(name) for name in names], seed)
+    if not (ending == CENSORED).any():  # no weight is handed on: sums of clusters are enough
+        counted_s = np.where(ending == DETECTED, np.minimum(time_s, horizon_s), horizon_s)
+        sums = np.stack([np.bincount(of, counted_s), np.bincount(of)], axis=1)
+        of_all = resampled.count.astype(float) @ sums
+        return _apart(*percentile_limits(of_all[:, 0] / of_all[:, 1], resampled, confidence=confidence))
+    order = np.lexsort((of, ending, time_s))
+    time_s, ending, of = time_s[order], ending[order], of[order]
+    at_s = np.unique(time_s[(ending == DETECTED) & (time_s < horizon_s)])
+    lengths_s = np.diff(np.append(at_s, horizon_s))
+    size = max(1, _CELLS // max(len(time_s), len(at_s), 1))
+    means = [
+        horizon_s - resampled_incidence(time_s, ending, resampled.count[k : k + size][:, of].astype(np.int64), at_s)
+        @ lengths_s
+        for k in range(0, len(resampled.count), size)
+    ]  # fmt: skip
+    return _apart(*percentile_limits(np.concatenate(means), resampled, confidence=confidence))
+
+
+def _apart(low: float, high: float) -> tuple[float, float] | None:
+    return (low, high) if high - low > _SAME_S else None

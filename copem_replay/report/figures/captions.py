@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.text import counted
+from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -59,3 +60,28 @@ def percent(share: float) -> str:
     if 0 < share < 0.0005 or 0.9995 < share < 1:
         return "< 0.1 %" if share < 0.5 else "> 99.9 %"
     return f"{100 * share:.1f} %" if 0 < share < 0.01 or 0.99 < share < 1 else f"{100 * share:.0f} %"
+
+
+def per_cent(share: float) -> str:
+    """`84.4`, `100`, `> 99.9`: a share in per cent to three significant digits; 100 and 0 only for all and nothing."""
+    if np.isnan(share):
+        return "–"
+    if 0 < share < 0.0005 or 0.9995 <= share < 1:
+        return "< 0.1" if share < 0.5 else "> 99.9"
+    return plain(100 * share)
+
+
+def plain(value: float) -> str:
+    """A number to three significant digits, from 1000 on a whole one; smaller than 10⁻⁹ is 0."""
+    return "0" if abs(value) < 1e-9 else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}".replace("-", "−")
+
+
+def few_in_words(results: Results) -> str:
+    """How many there are of what would be resampled, where these are too few: `2 objects`."""
+    table = results.table
+    logs, things = table["log"].nunique(), table.groupby(["log", "object_id"]).ngroups
+    if max(logs, things) >= FEWEST_CLUSTERS:
+        return ""
+    if things == 1:
+        return f"{counted(results.experiment.runs, 'run')} of one object"
+    return counted(things, "object") + (f" in {counted(logs, 'log')}" if logs > 1 else "")

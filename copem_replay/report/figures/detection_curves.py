@@ -21,6 +21,7 @@ from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.report.figures.bands import band
 from copem_replay.report.figures.captions import list_rates, percent, short_names, study
+from copem_replay.report.figures.selection import left_out, that_differ
 from copem_replay.report.figures.style import (
     FAINT,
     Appearance,
@@ -43,6 +44,8 @@ MOST_BANDS = 6
 """More bands than this hide each other (chosen)."""
 _COLUMNS = 3
 """Panels side by side where each configuration has one (chosen)."""
+_MOST_PANELS = 24
+"""More panels than this are longer than a page (chosen)."""
 _EXACT: dict[str, Any] = {"color": "black", "linewidth": 0.7, "linestyle": (0, (5, 3))}
 _INSTANTS = 600
 """At which a band is drawn, at most (chosen: a few per pixel's width)."""
@@ -68,16 +71,17 @@ class DetectionCurve:
 
 
 def curves_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """Share detected over the time since the onset.
+    """Share detected over the time since the onset, of up to twelve configurations that differ.
 
     With 95 % bands, unless there are too many of them, and the exact curves, where there are some.
     """
-    names = results.chosen(configurations)
+    every = results.chosen(configurations)
+    names = that_differ(results, every)
     over, curves = curves_of(results, names, bands=len(names) <= MOST_BANDS)
     exact = {name: exact_curve(results.exact, name) for name in names} if results.exact is not None else {}
     with style():
         figure = _drawn(results, curves, exact)
-        _note(figure, results, names, over, curves, bool(exact))
+        _note(figure, results, names, over, curves, bool(exact), left_out(every, names))
         return figure
 
 
@@ -162,7 +166,8 @@ def _drawn(results: Results, curves: dict[str, DetectionCurve], exact: dict[str,
 
 def one_by_one_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """The same curves, each with its band in a panel of its own; thin: that of the first configuration."""
-    names = results.chosen(configurations)
+    every = results.chosen(configurations)
+    names = that_differ(results, every, _MOST_PANELS)
     over, curves = curves_of(results, names)
     looks, short = appearances(tuple(results.experiment.configurations)), short_names(names)
     begin_s, end_s = time_axis(list(curves.values()))
@@ -185,7 +190,8 @@ def one_by_one_figure(results: Results, *, configurations: Sequence[str] | None 
         for axes in panels[:, 0]:
             axes.set_ylabel("Detected by then")
         bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
-        add_note(figure, [study(results, names), f"Thin: {short[names[0]]}", bands if over else "No bands"])
+        said = [study(results, names), f"Thin: {short[names[0]]}", bands if over else "No bands"]
+        add_note(figure, [*said, left_out(every, names)])
     return figure
 
 
@@ -235,6 +241,7 @@ def _note(
     over: str | None,
     curves: dict[str, DetectionCurve],
     exact: bool,
+    left: str,
 ) -> None:
     bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
     if over is None:
@@ -249,6 +256,7 @@ def _note(
     add_note(
         figure,
         [
+            left,
             study(results, names),
             list_rates(results.summary, names),
             "Cumulative incidence of detection: what departs undetected is never detected",

@@ -16,6 +16,7 @@ from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.report.figures.captions import list_rates, percent, short_names, study
 from copem_replay.report.figures.style import (
+    FAINT,
     INK,
     Appearance,
     add_note,
@@ -137,7 +138,7 @@ def _panel(
         never = int((~known).sum())
         with of_configuration(list(looks).index(name), axes):
             _points(axes, distance_m[placed], across, kind[placed], looks[name], name, len(table), judged)
-            axes.text(-0.07 * top_m, k, f"{never}", ha="center", va="center_baseline", color=INK if never else "0.6")
+            axes.text(-0.07 * top_m, k, f"{never}", ha="center", va="center_baseline", color=INK if never else FAINT)
     axes.axvspan(-0.14 * top_m, 0, color="0.95", zorder=0)
     axes.text(-0.07 * top_m, -0.62, _NEVER[column], ha="center", va="bottom", fontsize=7, color="0.3")
     axes.set_xlim(-0.14 * top_m, 1.04 * top_m)

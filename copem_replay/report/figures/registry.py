@@ -9,25 +9,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import MOST_BANDS, curves_figure, one_by_one_figure
+from copem_replay.report.figures.differences import differences_figure, no_differences
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
 from copem_replay.report.figures.sweeps import sweeps_figure
+from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What is drawn. None: all configurations; of log, object and run the ones that tell most (`choose`)."""
+    """What is drawn. None: all configurations; of log, object and run the ones that tell most (`choose`).
+
+    `differences`: to a baseline, where they are known already; None: to the default baseline.
+    """
 
     configurations: tuple[str, ...] | None = None
     log: str | None = None
     object_id: str | None = None
     run: int | None = None
+    differences: Comparison | None = None
 
 
 def _nothing_missing(results: Results, selection: Selection) -> str | None:
@@ -65,6 +73,22 @@ def _few_enough(results: Results, selection: Selection) -> str | None:
     return "" if len(results.chosen(selection.configurations)) <= MOST_BANDS else None
 
 
+def _no_differences(results: Results, selection: Selection) -> str | None:
+    why = no_differences(results, results.chosen(selection.configurations), selection.differences)
+    return None if why is None else ""
+
+
+def _no_trade_off(results: Results, selection: Selection) -> str | None:
+    return no_trade_off(results, results.chosen(selection.configurations))
+
+
+def _trade_off_about(results: Results) -> Sequence[str]:
+    return (
+        "A false positive is an entry of a fused list at no object. A fusion that keeps more entries detects sooner, "
+        "and keeps more false positives; times at equal rates are in the table of differences.",
+    )
+
+
 def _no_sweep(results: Results, selection: Selection) -> str | None:
     names = results.chosen(selection.configurations)
     if results.sweep is None:
@@ -80,8 +104,8 @@ def _no_stages(results: Results, selection: Selection) -> str | None:
 
 def _curves_about(results: Results) -> Sequence[str]:
     return (
-        "A curve gives the share of all looks (measured objects × runs × logs) that are detected this long after the "
-        "clock started: the cumulative incidence of detection (Aalen–Johansen, departure competing). Objects that "
+        "A curve gives the share of all rows (measured objects × runs × logs) that are detected this long after the "
+        "onset: the cumulative incidence of detection (Aalen–Johansen, departure competing). Objects that "
         "leave the scene undetected count as never detected and keep the curve below 100 %. Where lines coincide, the "
         "thinner ones are on top.",
     )
@@ -95,6 +119,24 @@ def _sweeps_about(results: Results) -> Sequence[str]:
 
 
 FIGURES: dict[str, FigureKind] = {
+    "answer": FigureKind(
+        "The answer",
+        "mean time to detection and share that passes, a dot with its interval per configuration, the soonest first",
+        lambda results, of: answer_figure(results, configurations=of.configurations),
+    ),
+    "differences": FigureKind(
+        "Differences",
+        "each configuration minus the baseline, a dot with its interval, and the line of 0",
+        lambda results, of: differences_figure(results, configurations=of.configurations, differences=of.differences),
+        missing=_no_differences,
+    ),
+    "trade_off": FigureKind(
+        "False positives against position error",
+        "false positives per minute over the position error, a mark per configuration",
+        lambda results, of: trade_off_figure(results, configurations=of.configurations),
+        missing=_no_trade_off,
+        about=_trade_off_about,
+    ),
     "runs": FigureKind(
         "Single runs",
         "speed of the ego, distance and visible share of one object in one run, a column per configuration",

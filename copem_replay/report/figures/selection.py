@@ -1,4 +1,4 @@
-"""What a figure of single runs shows: whose run, which one, in which configurations."""
+"""What figures show of many: whose run, which one, and which configurations where not all have a place."""
 
 from __future__ import annotations
 
@@ -10,24 +10,29 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import InputError
+from copem_replay.report.figures.captions import short_names
+from copem_replay.report.figures.contenders import soonest_first, truths
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
 
 _COLUMNS = 4
 """Runs side by side unless configurations are named (chosen: the paper's)."""
+MOST_LINES = 12
+"""Configurations in one plot, at most (chosen: more cannot be told apart)."""
 _NAMED = 12
 """Ids named in an error (chosen)."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One object in one run of one log, in some configurations."""
+    """One object in one run of one log, in some configurations; `named`: these were asked for."""
 
     log: str
     object_id: str
     run: int
     configurations: tuple[str, ...]
+    named: bool
 
 
 def choose(
@@ -38,8 +43,8 @@ def choose(
     object_id: str | None = None,
     run: int | None = None,
 ) -> Choice:
-    """What was asked for; by default the first object in conflict (else the first one), the run that is in the .rrd
-    (else the first), and four configurations from worst to best.
+    """What was asked for; by default the object that tells most (`most_telling`) and the run that is in the .rrd, else
+    the first; of an object in conflict four configurations from worst to best, else up to twelve that differ.
 
     Raises InputError for what is not among the results.
     """
@@ -52,14 +57,75 @@ def choose(
                 there = ", ".join(map(str, known[:_NAMED])) + (", …" if len(known) > _NAMED else "")
                 raise InputError(f"{where}: {key}: expected one of {there}; found {wanted!r}")
     named = results.chosen(configurations)
-    first = rows[rows["conflict"]] if "conflict" in rows and rows["conflict"].any() else rows
-    log, object_id = str(first["log"].iloc[0]), str(first["object_id"].iloc[0])
-    rows = rows[(rows["log"] == log) & (rows["object_id"] == object_id)]
-    if run is None:
-        run = results.provenance.run_shown.get(log, int(rows["run"].min()))
-    if run not in rows["run"].to_numpy():
+    of_run = rows[rows["run"] == (_run_shown(results, rows) if run is None else run)]
+    if not len(of_run):
         raise InputError(f"{where}: run: expected {rows['run'].min()} to {rows['run'].max()}, found {run}")
-    return Choice(log, object_id, run, named if configurations else worst_to_best(rows, named))
+    log, object_id = most_telling(of_run, truths(results))
+    rows = rows[(rows["log"] == log) & (rows["object_id"] == object_id)]
+    run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
+    shown = named
+    if not configurations:
+        judged = "conflict" in rows and bool(rows["conflict"].any())
+        shown = worst_to_best(rows, named) if judged else that_differ(results, named)
+    return Choice(log, object_id, run, shown, bool(configurations))
+
+
+def _run_shown(results: Results, rows: pd.DataFrame) -> pd.Series:
+    """Of each row the run of its log that is in the .rrd, else the first."""
+    return rows["log"].map(results.provenance.run_shown).fillna(rows["run"].min()).astype(int)
+
+
+def most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, str]:
+    """Log and id of the object that tells most: in conflict with the ego, known at different times, late.
+
+    As `telling` of the viewer has it; of equals the first. Never known counts as known at the end; `upper`, the ground
+    truth, does not count beside others.
+    """
+    others = table[~table["configuration"].isin(list(upper))]
+    rows = others if len(others) else table
+    time_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"])
+    keys = [rows["log"], rows["object_id"]]
+    of_each = time_s.groupby(keys, sort=False)
+    conflict = rows["conflict"] if "conflict" in rows else pd.Series(False, index=rows.index)
+    rank = pd.DataFrame(
+        {
+            "conflict": conflict.fillna(False).astype(bool).groupby(keys, sort=False).any(),
+            "apart": of_each.max() - of_each.min(),
+            "late": of_each.max(),
+        }
+    )
+    log, object_id = rank.sort_values(list(rank), ascending=False, kind="stable").index[0]
+    return str(log), str(object_id)
+
+
+def that_differ(results: Results, names: Sequence[str], most: int = MOST_LINES) -> tuple[str, ...]:
+    """At most so many configurations, in their order: all, or the first of those that detect alike.
+
+    Where these still are too many, evenly from the soonest to the latest.
+    """
+    if len(names) <= most:
+        return tuple(names)
+    keys = ["log", "object_id", "run"]
+    times = results.table.set_index([*keys, "configuration"])["time_to_detection_s"].unstack("configuration").round(6)
+    first: dict[bytes, str] = {}
+    for name in names:
+        first.setdefault(times[name].to_numpy(dtype=float).tobytes(), name)
+    kept = evenly(soonest_first(results, list(first.values())), most)
+    return tuple(name for name in names if name in kept)
+
+
+def evenly(ranked: Sequence[str], most: int) -> tuple[str, ...]:
+    """So many of them, the first and the last among them."""
+    picked = np.unique(np.rint(np.linspace(0, len(ranked) - 1, min(most, len(ranked)))).astype(int))
+    return tuple(ranked[k] for k in picked)
+
+
+def left_out(names: Sequence[str], shown: Sequence[str]) -> str:
+    """Which configurations a figure leaves out; empty: none."""
+    left = [short for name, short in short_names(names).items() if name not in shown]
+    if not left:
+        return ""
+    return f"{len(shown)} of {len(names)} configurations, from the soonest to the latest; not drawn: {', '.join(left)}"
 
 
 def worst_to_best(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
@@ -74,5 +140,4 @@ def worst_to_best(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
         passes = rows["braking_pass"].astype(float).groupby(rows["configuration"]).mean()
     # Of equals the first counts as the better one: by custom that is the truth.
     ranked = sorted(names, key=lambda name: (passes[name], -late_s[name], -names.index(name)))
-    picked = np.unique(np.rint(np.linspace(0, len(ranked) - 1, min(_COLUMNS, len(ranked)))).astype(int))
-    return tuple(ranked[k] for k in picked)
+    return evenly(ranked, _COLUMNS)

@@ -1,8 +1,8 @@
 """How figures look: one colour, dash, width and marker per configuration, the same in every figure.
 
-Colours come from `core/colours.py`; what would be hard to see on white has a darker outline. Dashes and markers tell
-configurations apart in grey, too, and lines get thinner from one to the next, so that curves that coincide lie on each
-other like stripes.
+Colours come from `core/colours.py`; what would be hard to see on white, or on a dark page, has an outline. Dashes
+and markers tell configurations apart in grey, too, and lines get thinner from one to the next, so that curves that
+coincide lie on each other like stripes.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 from copem_replay.core.colours import configuration_colours
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 Colour = tuple[float, float, float]
 
 INK: Colour = (0.15, 0.15, 0.15)
-FAINT: Colour = (0.55, 0.55, 0.55)
+FAINT: Colour = (0.45, 0.45, 0.45)
 NOTE_PT = 7.5
 """Size of the line that says what a figure shows (points)."""
 
@@ -38,8 +39,11 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 _WIDEST_PT, _THINNEST_PT = 4.4, 1.5
 _PALE = 0.4
 """How much of a colour is left in its pale version (chosen)."""
-_NEEDS_OUTLINE = 1.9
-"""Contrast with white below which a colour gets an outline (chosen: of the palette only the yellow)."""
+_NEEDS_OUTLINE = 3.0
+"""Contrast with the paper, white or dark, below which a colour gets an outline. Source: WCAG 2.1, 1.4.11."""
+WHITE: Colour = (1.0, 1.0, 1.0)
+DARK: Colour = (27 / 255, 27 / 255, 27 / 255)
+"""Paper: of a file, and of the report on a dark screen."""
 
 _STYLE: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib: the same on every machine
@@ -76,12 +80,7 @@ class Appearance:
     @property
     def pale(self) -> Appearance:
         """The same, mixed with white: see-through lines would show what lies below them, their outlines too."""
-
-        def mixed(colour: Colour) -> Colour:
-            red, green, blue = (1 - _PALE * (1 - channel) for channel in colour)
-            return red, green, blue
-
-        return replace(self, colour=mixed(self.colour), edge=mixed(self.edge))
+        return replace(self, colour=_mixed(self.colour, WHITE, 1 - _PALE), edge=_mixed(self.edge, WHITE, 1 - _PALE))
 
     def line(self, width_pt: float | None = None) -> dict[str, Any]:
         """Arguments of a matplotlib line."""
@@ -104,11 +103,11 @@ def appearances(configurations: Sequence[str]) -> dict[str, Appearance]:
     result = {}
     for k, (name, rgb) in enumerate(configuration_colours(configurations).items()):
         red, green, blue = (channel / 255 for channel in rgb)
-        edge = (red * 0.55, green * 0.55, blue * 0.55) if _contrast((red, green, blue)) < _NEEDS_OUTLINE else None
+        edge = _outline((red, green, blue))
         width = _WIDEST_PT + (_THINNEST_PT - _WIDEST_PT) * k / max(count - 1, 1)
         result[name] = Appearance(
             (red, green, blue),
-            edge or (red, green, blue),
+            edge,
             _DASHES[k % len(_DASHES)],
             _MARKERS[k % len(_MARKERS)],
             width,
@@ -116,10 +115,27 @@ def appearances(configurations: Sequence[str]) -> dict[str, Appearance]:
     return result
 
 
-def _contrast(colour: Colour) -> float:
-    """Contrast with white, 1 (none) to 21. Source: WCAG 2.1, relative luminance."""
+def _outline(colour: Colour) -> Colour:
+    """Darker where white paper needs it, lighter where dark paper does, else the colour itself."""
+    if contrast(colour, WHITE) < _NEEDS_OUTLINE:
+        return _mixed(colour, (0.0, 0.0, 0.0), 0.45)
+    return _mixed(colour, WHITE, 0.45) if contrast(colour, DARK) < _NEEDS_OUTLINE else colour
+
+
+def _mixed(colour: Colour, other: Colour, share: float) -> Colour:
+    red, green, blue = (one + share * (two - one) for one, two in zip(colour, other, strict=True))
+    return red, green, blue
+
+
+def contrast(colour: Colour, other: Colour) -> float:
+    """Contrast of two colours, 1 (none) to 21. Source: WCAG 2.1, relative luminance."""
+    low, high = sorted(map(_luminance, (colour, other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def _luminance(colour: Colour) -> float:
     red, green, blue = (c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in colour)
-    return 1.05 / (0.2126 * red + 0.7152 * green + 0.0722 * blue + 0.05)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 @contextmanager
@@ -134,15 +150,21 @@ def style() -> Iterator[None]:
         yield
 
 
+_MARKED: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
+"""How many artists of a figure are marked as those of some configuration."""
+
+
 @contextmanager
 def of_configuration(number: int, *panels: Axes) -> Iterator[None]:
     """Mark what is drawn into panels meanwhile as that of a configuration: a page of HTML can then hide it."""
     before = {id(artist) for axes in panels for artist in axes.get_children()}
     yield
     drawn = [artist for axes in panels for artist in axes.get_children() if id(artist) not in before]
-    marked = len(panels[0].get_figure(root=True).findobj(lambda artist: bool(artist.get_gid())))  # type: ignore[union-attr]
+    figure = panels[0].get_figure(root=True)
+    marked = _MARKED.get(figure, 0)
     for place, artist in enumerate(drawn, start=marked):
         artist.set_gid(f"configuration-{number}-{place}")
+    _MARKED[figure] = marked + len(drawn)
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

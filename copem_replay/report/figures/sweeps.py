@@ -15,6 +15,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.text import interval_words
 from copem_replay.core.tracks import Float
 from copem_replay.report.figures.captions import list_rates, short_names
+from copem_replay.report.figures.selection import MOST_LINES, evenly, left_out
 from copem_replay.report.figures.style import Appearance, add_note, appearances, new_figure, of_configuration, style
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ AXES = {
     "rate_hz": "Rate of the units (lists per second)",
     "units": "Number of units",
     "penetration_rate": "Share of vehicles that carry a unit",
+    "correlation_s": "Correlation time of detection (s)",
 }
 _ROWS = {
     "pass_share": "Share that passes",
@@ -49,6 +51,8 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     kinds = list(dict.fromkeys(sweep["sweep"]))
     if not kinds:
         raise InputError(f"{results.folder}/sweep.csv: expected rows of {', '.join(wanted)}, found none")
+    every, wanted = wanted, _that_differ(sweep, wanted)
+    sweep = sweep[sweep["configuration"].isin(wanted)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
     looks = appearances(tuple(dict.fromkeys([*results.experiment.configurations, *wanted])))
     with style():
@@ -70,8 +74,15 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
                 axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
         _close_open_bands(panels[-1])
         _legend(figure, panels, kinds, wanted)
-        add_note(figure, _note(results, sweep, kinds, wanted))
+        add_note(figure, [*_note(results, sweep, kinds, wanted), left_out(every, wanted)])
     return figure
+
+
+def _that_differ(sweep: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
+    """At most twelve, evenly from the soonest to the latest, by the mean over all values."""
+    mean_s = sweep["ttd_rmst_s"].groupby(sweep["configuration"]).mean() if "ttd_rmst_s" in sweep else pd.Series()
+    kept = evenly(sorted(names, key=lambda name: float(mean_s.get(name, 0.0))), MOST_LINES)
+    return tuple(name for name in names if name in kept)
 
 
 def swept_name(name: str, kind: str) -> str:

@@ -1,4 +1,4 @@
-"""The answer in words: who wins, by how much, how sure that is, and what cannot be said."""
+"""The answer in words: which configuration wins, by how much, how sure that is, and what cannot be said."""
 
 from __future__ import annotations
 
@@ -10,28 +10,31 @@ import pandas as pd
 from copem_replay.core.text import counted
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS
-from copem_replay.metrics.summary_text import cell
-from copem_replay.report.figures.captions import percent
+from copem_replay.report.figures.captions import per_cent, plain
+from copem_replay.report.figures.contenders import RANKED_BY
+from copem_replay.report.html.headers import signed_difference
 from copem_replay.report.html.markup import Html, joined, listed, tag
 from copem_replay.report.html.setup import some, together
-from copem_replay.report.html.study import RANKED_BY, Study
-from copem_replay.report.html.ties import as_soon_as_the_best, at_once, no_interval
+from copem_replay.report.html.study import Study
+from copem_replay.report.html.ties import as_soon_as_the_best, at_once, why_no_interval
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.limits import ALL_ALIKE
-from copem_replay.results.compare.tables import NOTHING, plain, signed
+from copem_replay.results.compare.tables import NOTHING
 
 
-def answer(study: Study) -> Html:
-    """All sentences, the most important one first."""
+def lead(study: Study) -> Html:
+    """The answer in a sentence or two."""
     if study.best is None:
-        return joined(
-            [
-                tag("p", "There is no answer: no measured object has an onset, so nobody was measured.", class_="lead"),
-                listed(str(note) for note in study.provenance.get("notes", [])),
-            ]
-        )
-    first, *others = _sentences(study)
-    return joined([tag("p", first, class_="lead"), listed(others)])
+        return tag("p", "There is no answer: no measured object has an onset.", class_="lead")
+    return tag("p", next(_sentences(study)), class_="lead")
+
+
+def more(study: Study) -> Html:
+    """All that has to be said besides, the most important first."""
+    if study.best is None:
+        return listed(str(note) for note in study.provenance.get("notes", []))
+    _, *others = _sentences(study)
+    return listed(others)
 
 
 def _sentences(study: Study) -> Iterator[str]:
@@ -39,9 +42,9 @@ def _sentences(study: Study) -> Iterator[str]:
     contenders = study.contenders
     share = rows["detected_share"].astype(float)
     if (share[list(study.names)] == 0).all():
-        yield "Nothing was detected: no configuration came to know of any measured object in any run."
+        yield "No configuration detects any measured object in any run."
     elif (share[list(contenders)] == 0).all():
-        yield "Nothing was detected but by the truth itself: no other configuration came to know of anybody in any run."
+        yield "Only the ground truth holds the measured objects: no configuration detects any of them in any run."
     else:
         yield _soonest(study)
         yield from _others(study)
@@ -50,55 +53,63 @@ def _sentences(study: Study) -> Iterator[str]:
     yield from _passes(study)
     yield from _accuracy(study)
     yield from _truth(study)
-    yield _how_sure(study)
+    yield from _how_sure(study)
     yield from _left_out(study)
 
 
 def _soonest(study: Study) -> Html:
     assert study.best is not None
     mean_s, horizon_s = (float(study.of(study.best)[key]) for key in (RANKED_BY, "ttd_rmst_horizon_s"))
-    counted_as = f"never detected counting as {cell(horizon_s)} s"
+    missed = (study.results.summary["detected_share"] < 1).any()
+    counted_as = f" (an object that is never detected counts as {plain(horizon_s)} s)" if missed else ""
     name = tag("b", study.best)
     if study.lead is None:
-        alone = "it is the only configuration" if len(study.names) == 1 else "only the truth stands beside it"
-        return joined([name, f" knew after {cell(mean_s)} s on the average ({counted_as}). There is nothing to compare "
+        alone = "it is the only configuration" if len(study.names) == 1 else "only the ground truth is beside it"
+        return joined([name, f" detects after {plain(mean_s)} s on average{counted_as}. There is nothing to compare "
                        f"it with: {alone}."])  # fmt: skip
     same = as_soon_as_the_best(study)
     if len(same) == 1:
         return _first(study, name, mean_s, counted_as)
     unsure = _told_apart(study.lead)[3]
-    unsure = unsure[unsure["configuration"].isin(same)]
-    when = (
-        "at once" if at_once(study) else f"at the very same times: after {cell(mean_s)} s on the average ({counted_as})"
-    )
-    why = f"; {no_interval(study, unsure)}" if len(unsure) else ""
+    when = "every object at its onset"
+    if not at_once(study):
+        when = f"at the same times: after {plain(mean_s)} s on average{counted_as}"
     rest = len(study.lead.configurations) + 1 - len(same)
     whom = f" The other {rest} are below." if rest > 1 else " The other is below." if rest else ""
-    return joined([tag("b", together(same)), f" knew {when}{why}.{whom}"])
+    return joined([_missing(study, unsure), tag("b", together(same)), f" detect {when}.{whom}"])
+
+
+def _missing(study: Study, unsure: pd.DataFrame) -> str:
+    """That differences have no interval, and why: before anything is said of them."""
+    if not len(unsure):
+        return ""
+    assert study.lead is not None
+    same = as_soon_as_the_best(study)
+    every = all(rows["configuration"].isin(same).all() for rows in _told_apart(study.lead)[:3])
+    apart = unsure[unsure["difference"].abs() > NOTHING]
+    of = "" if every else f" of the difference to {together(list((apart if len(apart) else unsure)['configuration']))}"
+    return f"No interval{of}: {why_no_interval(study, unsure)}. "
 
 
 def _first(study: Study, name: Html, mean_s: float, counted_as: str) -> Html:
-    """Where no other knew at the same times as the best. That there is no interval is said before who it is."""
+    """Where no other detects at the same times as the best. That there is no interval is said before which it is."""
     assert study.lead is not None
     later, alike, sooner, unsure = _told_apart(study.lead)
     undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
-    before = ""
-    if len(unsure):
-        why = no_interval(study, unsure)
-        of = f" of the difference to {some(list(unsure['configuration']))}" if len(unsure) < others else ""
-        before = f"{why[:1].upper()}{why[1:]}{of}. "
+    before = _missing(study, unsure)
     level = list(unsure.loc[unsure["difference"].abs() <= NOTHING, "configuration"])
     if level:
         names = tag("b", together([str(study.best), *level]))
-        return joined([before, names, f" have the same mean time, {cell(mean_s)} s ({counted_as}), though they did not "
-                       "always know at the same time."])  # fmt: skip
+        return joined([before, names, f" have the same mean time, {plain(mean_s)} s{counted_as}, though they do not "
+                       "always detect at the same time."])  # fmt: skip
     whom = f"the other {others}" if others > 1 else study.lead.configurations[0]
-    has, sure = f" has the shortest mean time, {cell(mean_s)} s", ""
+    has, sure = f" has the shortest mean time, {plain(mean_s)} s", ""
     if len(later) == others:
-        has, sure = f" knew soonest, after {cell(mean_s)} s on the average", f", sooner than {whom}"
+        has, sure = f" detects soonest, after {plain(mean_s)} s on average", f", sooner than {whom}"
     elif undecided:
-        sure = f", but cannot be told from {f'{undecided} of ' if undecided < others else ''}{whom}"
-    return joined([before, name, f"{has} ({counted_as}){sure}."])
+        to = f"{undecided} of {whom}" if undecided < others else whom
+        sure = f", but the interval of its difference to {to} includes 0"
+    return joined([before, name, f"{has}{counted_as}{sure}."])
 
 
 def _told_apart(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
@@ -120,21 +131,21 @@ def _others(study: Study) -> Iterator[str]:
     later, alike, sooner, unsure = (rows[~rows["configuration"].isin(same)] for rows in _told_apart(study.lead))
     unsure = unsure[unsure["difference"].abs() > NOTHING]
     if len(later):
-        yield f"Later than that, the interval of the difference excluding 0: {_each(later)}."
+        yield f"Later, the interval of the difference excluding 0: {_each(later)}."
     if len(alike):
         yield (
-            f"No difference to it can be shown, the interval including 0: {_each(alike)}. That is not to say that "
-            "there is none."
+            f"No difference to it is shown, the interval including 0: {_each(alike)}. That does not show that there is "
+            "none."
         )
     if len(sooner):  # by pairs a mean over censored times may rank the other way round
         yield f"Sooner by pairs, though later in the table: {_each(sooner)}."
     if len(unsure):
-        yield f"After it, by differences without an interval: {_each(unsure)}."
+        yield f"Later, without an interval: {_each(unsure)}."
     if len(later) and len(study.contenders) > 2:
         one = len(same) == 1
         yield (
-            f"The {'winner was' if one else 'winners were'} picked by these same figures, which flatters "
-            f"{'it' if one else 'them'} a little."
+            f"The same figures pick the {'winner, which flatters it' if one else 'winners, which flatters them'} a "
+            "little."
         )
 
 
@@ -143,7 +154,7 @@ def _each(rows: pd.DataFrame) -> str:
 
 
 def _difference(row: Any, unit: str = " s") -> str:
-    shown = f"{signed(row.difference)}{unit}"
+    shown = signed_difference("", row.difference) + unit
     if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
         return shown
     return f"{shown} [{plain(row.low)}, {plain(row.high)}]"
@@ -155,7 +166,7 @@ def _against_baseline(study: Study) -> Iterator[str]:
     row = _of(study.regret, RANKED_BY).set_index("configuration").loc[study.best]
     if pd.isna(row["difference"]):
         return
-    yield f"{study.best} against {study.baseline}, the baseline: {_difference(row)} in the mean time{_unsure(row)}."
+    yield f"{study.best} minus {study.baseline}, the baseline: {_difference(row)} in the mean time{_unsure(row)}."
 
 
 def _unsure(row: Any) -> str:
@@ -169,21 +180,24 @@ def _unsure(row: Any) -> str:
 def _detected(study: Study, share: pd.Series) -> Iterator[str]:
     never = [name for name in study.contenders if share[name] == 0]
     if never:
-        yield f"Never knew of anybody: {some(never)}."
+        yield f"{together(never)} never {'detects' if len(never) == 1 else 'detect'} any object."
     if (share[list(study.contenders)] == 1).all():
-        yield "Everybody was detected in every run, in every configuration."
+        yield "Every configuration detects every measured object in every run."
         return
     missed = [(name, 1 - float(share[name])) for name in study.contenders if 0 < share[name] < 1]
     if missed:
         worst, least = max(missed, key=lambda one: one[1]), min(missed, key=lambda one: one[1])
-        rows = "of the rows (objects × runs) never detected"
-        if percent(worst[1]) == percent(least[1]):
-            whom = some([name for name, _ in missed])
-            yield f"{whom}: {'each ' if len(missed) > 1 else ''}{percent(worst[1])} {rows}. Who that is, is said below."
+        rows = "of the rows (objects × runs)"
+        if per_cent(worst[1]) == per_cent(least[1]):
+            whom = together([name for name, _ in missed])
+            yield (
+                f"{whom} {'each miss' if len(missed) > 1 else 'misses'} {per_cent(worst[1])} % {rows}; Never detected "
+                "names the objects."
+            )
         else:
             yield (
-                f"{len(missed)} configurations missed somebody, from {least[0]} with {percent(least[1])} to {worst[0]} "
-                f"with {percent(worst[1])} {rows}. Who that is, is said below."
+                f"{len(missed)} configurations miss some objects, from {least[0]} with {per_cent(least[1])} % to "
+                f"{worst[0]} with {per_cent(worst[1])} % {rows}; Never detected names the objects."
             )
 
 
@@ -193,7 +207,7 @@ def _passes(study: Study) -> Iterator[str]:
         return
     judged = rows.loc[[name for name in study.contenders if pd.notna(rows.loc[name, "pass_share"])]]
     if not len(judged):
-        yield "Braking: nobody is in conflict with the ego, so there is nothing to judge."
+        yield "Braking: no object is in conflict with the ego, so there is nothing to judge."
         return
     share = judged["pass_share"].astype(float)
     best, worst = str(share.idxmax()), str(share.idxmin())
@@ -214,8 +228,8 @@ def _passes(study: Study) -> Iterator[str]:
 
 def _share(row: Any) -> str:
     low, high = row["pass_share_low"], row["pass_share_high"]
-    shown = percent(float(row["pass_share"]))
-    return shown if pd.isna(low) else f"{shown} [{percent(float(low))}, {percent(float(high))}]"
+    shown = f"{per_cent(float(row['pass_share']))} %"
+    return shown if pd.isna(low) else f"{shown} [{per_cent(float(low))}, {per_cent(float(high))}]"
 
 
 def _accuracy(study: Study) -> Iterator[str]:
@@ -228,50 +242,49 @@ def _accuracy(study: Study) -> Iterator[str]:
     if len(known) > 1 and known.min() < known.max():
         best, worst = (list(known.index[(known - one).abs() <= NOTHING]) for one in (known.min(), known.max()))
         yield (
-            "The best lists, places, misses and false entries taken together, by means without an interval, had "
-            f"{together(best)}: GOSPA {cell(known.min())} m, against {cell(known.max())} m with {together(worst)}"
-            f"{more}."
+            f"The best lists are those of {together(best)}, by means without an interval: GOSPA (positions, misses and "
+            f"false positives in one number) of {plain(known.min())} m, against {plain(known.max())} m with "
+            f"{together(worst)}{more}."
         )
 
 
 def _truth(study: Study) -> Iterator[str]:
     truth = [name for name in study.names if name not in study.contenders]
     if truth:
-        yield f"{', '.join(truth)}: the truth itself, what could be had at best; no contender."
+        yield f"{together(truth)} {'is' if len(truth) == 1 else 'are'} the ground truth: the upper bound, not ranked."
 
 
-def _how_sure(study: Study) -> str:
+def _how_sure(study: Study) -> Iterator[str]:
     over, kind = (study.results.summary[name].dropna() for name in ("interval_over", "interval"))
     if not len(over) and (kind == NOTHING_DRAWN).any():
-        return (
-            "How sure: there are no intervals, for every run is the same: recorded lists and the truth are not drawn. "
-            "What is said holds for this one object; more runs would not tell about other traffic."
+        yield (
+            "There are no intervals: every run is the same, for recorded lists and the ground truth are not drawn. The "
+            "result holds for this one object; additional runs do not tell about other traffic."
         )
+        return
     if not len(over):
-        return (
-            f"How sure: there are no intervals, for there are fewer than {FEWEST_CLUSTERS} logs and fewer than "
-            f"{FEWEST_CLUSTERS} measured objects. What is said holds for these objects; more runs would not tell about "
-            "other traffic."
+        yield (
+            f"There are no intervals: there are fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
+            "measured objects. The result holds for these objects; additional runs of the same traffic do not tell "
+            "about other traffic."
         )
+        return
     tells = {
-        "runs": "how far other draws of the same models might differ, for this one object in this one log; they do not "
+        "runs": "how far other draws of the same models may differ, for this one object in this one log; they do not "
         "tell about other traffic",
-        "objects": "how far other objects in traffic of this kind might differ",
-        "logs": "how far other recordings of this kind might differ",
+        "objects": "how far other objects in traffic of this kind may differ",
+        "logs": "how far other recordings of this kind may differ",
     }[str(over.iloc[0])]
-    return (
-        f"How sure: intervals are 95 %, in brackets, over {over.iloc[0]}. They say {tells}. A difference that is "
-        "the same throughout has none: how it varies is not known."
-    )
+    yield f"Intervals are 95 %, in brackets, over {over.iloc[0]}: {tells}."
 
 
 def _left_out(study: Study) -> Iterator[str]:
     skipped = [str(log["log"]) for log in study.provenance.get("logs_skipped", [])]
     if skipped:
-        yield f"In no figure, for it could not be replayed: {some(skipped)}."
+        yield f"In no figure, because the replay failed: {some(skipped)}."
     notes = study.provenance.get("notes", [])
     if notes:
-        yield f"{counted(len(notes), 'note')} on recordings and experiment: see Notes."
+        yield f"{counted(len(notes), 'note')} on recordings and experiment: see Where this comes from."
 
 
 def _of(comparison: Comparison, metric: str) -> pd.DataFrame:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from copem_replay.report.figures.registry import FigureKind, Selection
 from copem_replay.report.figures.render import rendered
+from copem_replay.report.html.greys import as_variables
 from copem_replay.report.html.markup import Html, tag
 
 if TYPE_CHECKING:
@@ -23,10 +24,10 @@ def _larger(size: re.Match[str]) -> str:
     return f'{size[1]}style="width: {_LARGER * float(size[2]):.0f}pt"'
 
 
-def embedded(name: str, kind: FigureKind, results: Results) -> Html:
+def embedded(name: str, kind: FigureKind, results: Results, selection: Selection) -> Html:
     """A figure as an element of a page, as wide as it was drawn where there is room. Raises RecordingError."""
-    svg = rendered(kind.draw(results, Selection()), (".svg",))[".svg"].decode("utf-8")
+    svg = rendered(kind.draw(results, selection), (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # texts are in comments, too: as users wrote them
-    svg = _SIZE.sub(_larger, _IDS.sub(f"{name}-", svg), count=1)
+    svg = as_variables(_SIZE.sub(_larger, _IDS.sub(f"{name}-", svg), count=1))
     plot = tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=kind.shows)
     return tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=kind.title)

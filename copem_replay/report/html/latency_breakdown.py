@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from copem_replay.metrics.summary_text import cell
+from copem_replay.report.figures.captions import plain
 from copem_replay.report.figures.latency_breakdown import HATCHES, STAGES, stages_of
-from copem_replay.report.html.markup import Html, joined, table, tag
+from copem_replay.report.html.markup import Html, folded, joined, table, tag
 from copem_replay.report.html.swatches import box
-from copem_replay.report.html.tables import named
+from copem_replay.report.html.tables import full, named
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import Study
@@ -30,12 +30,13 @@ def stage_table(study: Study) -> Html:
     rows = {name: table[table["configuration"] == name] for name in study.names}
     known = {name: (int(of["detected"].sum()), len(of)) for name, of in rows.items()}
     about = (
-        "Where the time goes, on the average over the looks in which the object became known; how many that is, where "
-        "not all, is beside the bar. Those that never did have no stages, so bars of configurations that miss many are "
-        "not about the same looks, and their sum is not ttd_rmst_s."
+        "Means over the rows in which the object is detected; how many these are, where not all, is beside the bar. "
+        "Rows without detection have no stages, so bars of configurations that miss many objects are over other rows, "
+        "and their sum is not the mean time to detection."
     )
     terms = [part for stage in there for part in (tag("dt", _box(stage), stage), tag("dd", STAGES[stage]))]
-    return joined([tag("p", about), tag("dl", *terms), _table(study, means, there, known)])
+    below = folded("What the stages are", tag("dl", *terms))
+    return joined([tag("p", about), _table(study, means, there, known), below])
 
 
 def _box(stage: str) -> Html:
@@ -50,7 +51,7 @@ def _table(
     for name in study.names:
         figures = [*(means[name].get(stage) for stage in there), sum(means[name].values()) if means[name] else None]
         cells = [
-            tag("td", cell(value), data_column=stage, data_value="" if value is None else f"{value:.9g}")
+            tag("td", "–" if value is None else plain(value), data_column=stage, data_value=full(value) or "")
             for stage, value in zip([*there, "sum"], figures, strict=True)
         ]
         counted = tag("td", f"{known[name][0]} of {known[name][1]}", data_column="detected")

@@ -49,6 +49,11 @@ def table(head: Sequence[str], rows: Iterable[str], *, caption: str = "", id_: s
     return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption or "table")
 
 
+def folded(title: str, *parts: str) -> Html:
+    """Parts that are shown when asked for, and on paper."""
+    return tag("details", tag("summary", title), *parts)
+
+
 def listed(items: Iterable[str]) -> Html:
     """A list, nothing where it is empty."""
     found = [tag("li", item) for item in items]

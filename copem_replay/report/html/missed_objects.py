@@ -1,4 +1,4 @@
-"""Who was never detected, by name; and how probable that is, where it is known without a draw."""
+"""Which objects were never detected, by name; and how probable that is, where it is known without a draw."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def never_detected(study: Study) -> Html:
     things = missed.groupby(["log", "object_id"]).ngroups
     every = table_of.groupby(["log", "object_id"]).ngroups
     said = (
-        f"{counted(things, 'object')} of the {every} measured, missed in some run by some configuration; most often "
-        "missed first. A row names all configurations that missed the object in as many runs."
+        f"{counted(things, 'object')} of the {every} measured, missed in some run by some configuration; the most "
+        "missed first. A row names all configurations that miss the object in as many runs."
     )
     head = ["log", "object", "class", "never in", "by", "looked at for (s)", "until"]
     whole = table(head, rows, caption="Objects never detected", id_="never")

@@ -2,62 +2,93 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 from copem_replay.report.figures.registry import FIGURES, Selection
-from copem_replay.report.html.conclusions import answer
+from copem_replay.report.html.conclusions import lead, more
 from copem_replay.report.html.embedded import embedded
+from copem_replay.report.html.greys import dark_greys
 from copem_replay.report.html.latency_breakdown import stage_table
-from copem_replay.report.html.markup import Html, joined, tag, text
+from copem_replay.report.html.markup import Html, joined, listed, tag, text
 from copem_replay.report.html.missed_objects import never_detected, without_a_draw
 from copem_replay.report.html.provenance import provenance
 from copem_replay.report.html.setup import configurations, question, setting
 from copem_replay.report.html.study import Study
 from copem_replay.report.html.swatches import swatch
-from copem_replay.report.html.tables import regret_table, summary_tables
+from copem_replay.report.html.tables import baseline_words, regret_table, summary_tables
 
 _POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
 """What a browser lets the page load: nothing."""
+_ANSWER, _DIFFERENCES = "answer", "differences"
 _BELOW = {"latency_breakdown": stage_table}
 """What stands below a figure."""
 
 
+@dataclass(frozen=True)
+class _Section:
+    id: str
+    title: str
+    parts: Sequence[Html]
+
+
 def page(study: Study) -> str:
     """The whole report as HTML, nothing of which has to be fetched."""
+    measured = len(study.results.table) > 0
     sections = [
-        _section("configurations-of-it", "What was compared", tag("p", setting(study)), configurations(study)),
-        _section("table", "Summary", summary_tables(study)),
-        _section("differences", "Differences", regret_table(study)),
+        _Section("differences-of-it", "Differences", _differences(study)),
+        *_figures(study, ("trade_off",)),
+        _Section("configurations-of-it", "What is compared", [tag("p", setting(study)), configurations(study)]),
+        _Section("table", "Summary", [summary_tables(study)]),
     ]
-    if len(study.results.table):
-        sections += _figures(study)
-        sections.append(_section("missed", "Never detected", never_detected(study), without_a_draw(study)))
-    sections.append(_section("provenance", "Where this comes from", provenance(study)))
+    if measured:
+        sections += _figures(study, [name for name in FIGURES if name not in (_ANSWER, _DIFFERENCES, "trade_off")])
+        sections.append(_Section("missed", "Never detected", [never_detected(study), without_a_draw(study)]))
+    sections.append(_Section("provenance", "Where this comes from", [provenance(study)]))
     title = f"When was it known? {', '.join(file.name for file in study.results.provenance.logs)}"
-    head = tag("header", tag("h1", "When was it known?"), tag("p", question(study), class_="question"), answer(study))
-    return _whole(title, joined([head, *sections]))
+    head = tag(
+        "header",
+        tag("h1", "When was it known?"),
+        tag("p", question(study), class_="question"),
+        lead(study),
+        *([_embedded(study, _ANSWER)] if measured else []),
+        more(study),
+        _contents(sections),
+        *([_key(study)] if measured and len(study.names) > 1 else []),
+    )
+    return _whole(title, joined([head, *(tag("section", tag("h2", s.title), *s.parts, id_=s.id) for s in sections)]))
 
 
-def _figures(study: Study) -> list[Html]:
+def _contents(sections: Sequence[_Section]) -> Html:
+    links = [tag("a", one.title, href=f"#{one.id}") for one in sections]
+    return tag("nav", listed(links), aria_label="Contents", class_="screen")
+
+
+def _embedded(study: Study, name: str) -> Html:
+    return embedded(name, FIGURES[name], study.results, Selection(differences=study.regret))
+
+
+def _differences(study: Study) -> list[Html]:
+    """The figure above the table that it is drawn from."""
+    if study.regret is None or FIGURES[_DIFFERENCES].missing(study.results, Selection(differences=study.regret)):
+        return [regret_table(study)]
+    return [baseline_words(study), _embedded(study, _DIFFERENCES), regret_table(study)]
+
+
+def _figures(study: Study, names: Sequence[str]) -> Iterator[_Section]:
     """A section for each figure that needs no recording; with the reason where it cannot be drawn."""
-    sections: list[Html] = []
-    for name, kind in FIGURES.items():
+    for name in names:
+        kind = FIGURES[name]
         why = "" if kind.needs_recording else kind.missing(study.results, Selection())
-        if why == "":
+        if why == "" or not len(study.results.table):
             continue
-        above = [_key(study)] if not sections and len(study.names) > 1 else []
         if why is not None:
-            sections.append(_section(f"section-{name}", kind.title, *above, tag("p", f"No figure: {why}.")))
+            yield _Section(f"section-{name}", kind.title, [tag("p", f"No figure: {why}.")])
             continue
         about = [tag("p", line) for line in kind.about(study.results)]
         below = [_BELOW[name](study)] if name in _BELOW else []
-        figure = embedded(name, kind, study.results)
-        sections.append(_section(f"section-{name}", kind.title, *above, *about, figure, *below))
-    return sections
-
-
-def _section(id_: str, title: str, *parts: Html) -> Html:
-    return tag("section", tag("h2", title), *parts, id_=id_)
+        yield _Section(f"section-{name}", kind.title, [*about, _embedded(study, name), *below])
 
 
 def _key(study: Study) -> Html:
@@ -79,8 +110,9 @@ def _whole(title: str, body: Html) -> str:
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+            '<meta name="color-scheme" content="light dark">',
             '<link rel="icon" href="data:,">',
-            f"<title>{text(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>",
+            f"<title>{text(title)}</title>\n<style>\n{style}{dark_greys(body)}</style>\n</head>\n<body>\n<main>",
             body,
             f"</main>\n<script>\n{script}</script>\n</body>\n</html>\n",
         ]

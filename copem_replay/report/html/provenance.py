@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from copem_replay.report.html.markup import Html, breakable, joined, listed, table, tag
+from copem_replay.report.html.markup import Html, breakable, folded, joined, listed, table, tag
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import Study
@@ -33,11 +33,9 @@ def provenance(study: Study) -> Html:
             tag("p", "Skipped, and not in any figure:" if skipped else "No recording was skipped."),
             listed(skipped),
             tag("h3", "Notes"),
-            listed(notes) or tag("p", "Nothing had to be said."),
-            tag("h3", "How it was made and measured"),
-            _pairs(made | measured, "Parameters", "parameters"),
-            tag("h3", "Libraries"),
-            _pairs(data.get("libraries", {}), "Versions of libraries", "libraries"),
+            listed(notes) or tag("p", "There are none."),
+            folded("How it was made and measured", _pairs(made | measured, "Parameters", "parameters")),
+            folded("Libraries", _pairs(data.get("libraries", {}), "Versions of libraries", "libraries")),
         ]
     )
 

@@ -46,16 +46,16 @@ def question(study: Study) -> str:
     experiment = study.results.experiment
     measure = experiment.measure
     if measure.objects.ids is not None:
-        whom = f"{'object' if len(measure.objects.ids) == 1 else 'objects'} {some(measure.objects.ids)}"
+        whom = f"object {together(measure.objects.ids)}"
     elif measure.objects.classes is not None:
         whom = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
     else:
-        whom = "everybody who moves"
+        whom = "each object that moves"
     which = f"each of {len(study.names)} configurations" if len(study.names) > 1 else "the one configuration"
     far = "" if experiment.measure.distance_to != "ego" or experiment.ego == "none" else ", and how far away,"
     return (
-        f"On {logs(study)}: how soon{far} would the receiver have known of {whom}, with {which} of perception "
-        "units, latencies and fusion?"
+        f"On {logs(study)}: how soon{far} is {whom} known to the receiver, with {which} of perception units, latencies "
+        "and fusion?"
     )
 
 
@@ -68,7 +68,7 @@ def setting(study: Study) -> str:
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (
         f"{counted(things, 'measured object')}, {counted(results.experiment.runs, 'run')}, so {counted(rows, 'row')} "
-        f"for each configuration; all see the same dice (seed {results.experiment.seed}). "
+        f"for each configuration; common random numbers per run (seed {results.experiment.seed}). "
         f"The clock of an object starts {_onset(results.experiment)}.{hits}"
     )
 
@@ -86,7 +86,7 @@ def configurations(study: Study) -> Html:
         truth = configuration.units == "truth"
         units = experiment.units_of(configuration)
         cells = (
-            "the truth itself" if truth else f"{len(units)}: {some(units)}" if len(units) > 1 else "".join(units),
+            "ground truth" if truth else f"{len(units)}: {some(units)}" if len(units) > 1 else "".join(units),
             "–" if truth else _fusion(configuration),
             _latency(configuration, units),
         )

@@ -88,13 +88,14 @@ class Comparison:
 
 
 def compare(
-    folders: Sequence[Path],
+    folders: Sequence[Path | Results],
     *,
     configurations: Sequence[str] | None = None,
     baseline: str | None = None,
     false_positives_per_min: float | None = None,
+    metrics: Sequence[str] | None = None,
 ) -> Comparison:
-    """Compare configurations (None: all) with a baseline (None: `ideal`), pair by pair.
+    """Compare configurations (None: all) with a baseline (None: `ideal`), pair by pair, in some metrics (None: all).
 
     `false_positives_per_min`: at which times to detection are compared once more; None: as many as the baseline has.
     Raises InputError, a line for every reason why something cannot be read or compared.
@@ -125,7 +126,7 @@ def compare(
             truth=against.configuration in against.results.truth,
         )  # fmt: skip
         mine = setting if reasons[one.label] is None else replace(setting, false_positives_per_min=None)
-        for regret in regrets(first, second, grid, mine):
+        for regret in regrets(first, second, grid, mine, metrics):
             names = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
             fixed = _fixed(regret.metric, one, against)
             rows += (row | names for row in _rows(regret, pair, grid, draws, fixed=fixed))

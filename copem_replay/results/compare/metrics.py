@@ -17,7 +17,7 @@ two points of a ROC curve. Resamples keep the thresholds and the share.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,17 +66,40 @@ class Regret:
     kept: tuple[Kept, Kept] | None = None
 
 
-def regrets(first: ConfigurationData, second: ConfigurationData, grid: Grid, setting: Setting) -> Iterator[Regret]:
-    """Every metric that both sides have what it takes for."""
+def regrets(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, setting: Setting, only: Sequence[str] | None = None
+) -> Iterator[Regret]:
+    """Every metric, or only some, that both sides have what it takes for."""
     cells = np.flatnonzero(first.there & second.there)
+    for names, made in _METRICS.items():
+        if only is None or not set(names).isdisjoint(only):
+            yield from (one for one in made(first, second, grid, cells, setting) if only is None or one.metric in only)
+
+
+def _of_detections(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
+) -> Iterator[Regret]:
     yield Regret("detected_share", _shares(grid, cells, first.detected[cells], second.detected[cells]))
     times = [(_times(side, side.detection_s, cells),) for side in (first, second)]
     yield Regret("ttd_rmst_s", _restricted_means(grid, cells, times[0], times[1], setting))
-    yield from _at_equal_ghosts(first, second, grid, cells, setting)
+
+
+def _of_distances(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
+) -> Iterator[Regret]:
     yield Regret("dad_median_m", _distances(first, second, grid, cells))
-    yield from _of_lists(first, second, grid, cells, setting.power)
+
+
+def _of_ghosts(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
+) -> Iterator[Regret]:
     if first.ghosts is not None and second.ghosts is not None:
         yield Regret("false_positives_per_min", _ghosts(first, second, first.ghosts, second.ghosts, grid, cells))
+
+
+def _of_braking(
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
+) -> Iterator[Regret]:
     if first.conflict is not None and second.conflict is not None:
         assert first.passes is not None
         assert second.passes is not None
@@ -198,7 +221,7 @@ def _distances(first: ConfigurationData, second: ConfigurationData, grid: Grid, 
 
 
 def _of_lists(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, power: float
+    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
 ) -> Iterator[Regret]:
     """Errors and GOSPA; lists are of no object in particular, so that their number stays when objects are resampled."""
     if first.accuracy is None or second.accuracy is None:
@@ -210,7 +233,7 @@ def _of_lists(
     there = both.measured > 0
     parts = np.concatenate([both.gospa, np.zeros((len(cells), 1))], axis=1)[there]
     whose, sums, n = _with_places(grid, cells[there], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
-    yield Regret("gospa_m", OfSums(whose=whose, n=n, sums=sums, of=_root(power)))
+    yield Regret("gospa_m", OfSums(whose=whose, n=n, sums=sums, of=_root(setting.power)))
 
 
 def _ghosts(
@@ -250,3 +273,14 @@ def _with_places(grid: Grid, cells: Int, of_cells: Float, of_places: Float, n: I
     )
     counts = np.concatenate([np.zeros(len(cells), dtype=np.int64), n[at]])
     return whose, np.concatenate([of_cells, of_places[at]]), counts
+
+
+_METRICS = {
+    ("detected_share", "ttd_rmst_s"): _of_detections,
+    ("ttd_rmst_s_equal_ghosts",): _at_equal_ghosts,
+    ("dad_median_m",): _of_distances,
+    ("position_rmse_m", "gospa_m"): _of_lists,
+    ("false_positives_per_min",): _of_ghosts,
+    ("pass_share",): _of_braking,
+}
+"""What makes which metrics, in the order of a comparison."""

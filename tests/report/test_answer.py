@@ -1,0 +1,383 @@
+"""The figures that answer first, read back from their artists: dots, intervals, differences, false positives.
+
+The scene of `tests/helpers/report_pages.py`: known after l seconds, the ego stops 14.5 − 10 l metres before him.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from importlib.resources import files
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.axes import Axes
+
+from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import InputError
+from copem_replay.metrics.intervals import every_resample
+from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
+from copem_replay.report.figures import (
+    FIGURES,
+    Results,
+    Selection,
+    answer_figure,
+    curves_figure,
+    differences_figure,
+    load_results,
+    one_by_one_figure,
+    trade_off_figure,
+)
+from copem_replay.report.figures.bands import mean_limits
+from copem_replay.report.figures.captions import per_cent, plain
+from copem_replay.report.figures.render import lay_out, rendered
+from copem_replay.report.figures.selection import choose, most_telling, that_differ
+from copem_replay.report.figures.style import DARK, WHITE, appearances, contrast, style
+from copem_replay.report.html.greys import INK, PAPER, as_variables, dark_greys
+from copem_replay.report.html.headers import (
+    difference_header,
+    header,
+    in_order,
+    number,
+    signed_difference,
+    without_unit,
+)
+from copem_replay.report.html.page import page as report_page
+from copem_replay.report.html.study import load_study
+from copem_replay.results.compare import compare
+from copem_replay.viewer.selection import telling
+from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """One pedestrian, six runs."""
+    return load_results(replayed(tmp_path_factory.mktemp("one"), changed(ONE)))
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Two pedestrians: nothing is resampled."""
+    return load_results(replayed(tmp_path_factory.mktemp("two"), changed()))
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return load_results(replayed(tmp_path_factory.mktemp("many"), eighteen()))
+
+
+def dots(axes: Axes) -> dict[str, tuple[float, bool]]:
+    """Where the dot of each configuration is, and whether it is filled."""
+    return {
+        str(c.get_label()): (float(c.get_offsets()[0][0]), tuple(c.get_facecolor()[0][:3]) != (1.0, 1.0, 1.0))
+        for c in axes.collections
+    }
+
+
+def intervals(axes: Axes) -> dict[str, tuple[float, float]]:
+    lines = [line for line in axes.get_lines() if str(line.get_label()).startswith("of ")]
+    return {str(line.get_label())[3:]: tuple(np.asarray(line.get_xdata(), dtype=float)) for line in lines}  # type: ignore[misc]
+
+
+def rows(axes: Axes) -> list[str]:
+    return [tick.get_text() for tick in axes.get_yticklabels()]
+
+
+def note(figure: object) -> str:
+    return " ".join(figure.texts[-1].get_text().split()).replace("\u00a0", " ")  # type: ignore[attr-defined]
+
+
+class TestAnswer:
+    def test_the_soonest_first_and_the_truth_is_a_line(self, results: Results) -> None:
+        times, shares = answer_figure(results).axes
+        assert rows(times) == ["half", "late", "hit", "never"]
+        summary = results.summary.set_index("configuration")
+        found = dots(times)
+        assert set(found) == {"half", "late", "hit"}, "what never detects has no dot among times"
+        for name, (value, _) in found.items():
+            assert value == pytest.approx(summary.loc[name, "ttd_rmst_s"])
+        assert "never (counts as 4.5 s)" in [text.get_text() for text in times.texts]
+        (truth,) = [line for line in times.get_lines() if line.get_label() == "GT"]
+        assert list(truth.get_xdata()) == [0, 0]
+        assert {name: value for name, (value, _) in dots(shares).items()} == {
+            "half": 100.0, "late": 100.0, "hit": 0.0, "never": 0.0,
+        }  # fmt: skip
+        for name, (low, high) in intervals(shares).items():
+            limits = [100 * summary.loc[name, f"pass_share_{end}"] for end in ("low", "high")]
+            assert [low, high] == pytest.approx(limits)
+
+    def test_what_is_the_same_in_every_run_has_no_interval_and_that_is_said_first(self, results: Results) -> None:
+        figure = answer_figure(results)
+        (times, _) = figure.axes
+        assert set(intervals(times)) == {"half"}
+        assert {name: filled for name, (_, filled) in dots(times).items()} == {
+            "half": True, "late": False, "hit": False,
+        }  # fmt: skip
+        assert note(figure).startswith("No interval of the mean time of late, hit (hollow): all runs alike. ")
+
+    def test_two_objects_have_no_interval_at_all(self, two: Results) -> None:
+        figure = answer_figure(two)
+        assert intervals(figure.axes[0]) == {}
+        assert note(figure).startswith("No interval of the mean time")
+        assert ": 2 objects. " in note(figure)
+        assert "95 % intervals" not in note(figure)
+
+    def test_only_some(self, results: Results) -> None:
+        figure = answer_figure(results, configurations=["hit", "late"])
+        assert rows(figure.axes[0]) == ["late", "hit"]
+        assert not [line for line in figure.axes[0].get_lines() if line.get_label() == "GT"]
+
+
+class TestMeanLimits:
+    @given(st.data())
+    @settings(max_examples=60, deadline=None)
+    def test_they_are_quantiles_of_the_means_of_all_resamples(self, data: st.DataObject) -> None:
+        """Of four clusters all 256 resamples, each written out row by row; some rows are censored."""
+        count = data.draw(st.integers(4, 14))
+        time_s = np.array(data.draw(st.lists(st.integers(0, 12), min_size=count, max_size=count))) / 4
+        codes = st.sampled_from([CENSORED, DETECTED, LEFT] if data.draw(st.booleans()) else [DETECTED, LEFT])
+        ending = np.array(data.draw(st.lists(codes, min_size=count, max_size=count)))
+        of = np.array([*range(4), *data.draw(st.lists(st.integers(0, 3), min_size=count - 4, max_size=count - 4))])
+        found = mean_limits(time_s, ending, [f"c{k}" for k in of], 2.5, 1)
+        resampled = every_resample(4)
+        means: list[float] = []
+        for chosen, times in zip(resampled.count, resampled.times, strict=True):
+            kept = np.repeat(np.arange(count), chosen[of])
+            means += [restricted_mean(*cumulative_incidence(time_s[kept], ending[kept]), 2.5)] * int(times)
+        if max(means) - min(means) < 1e-9:
+            assert found is None
+            return
+        assert found is None or min(means) - 1e-9 <= found[0] < found[1] <= max(means) + 1e-9
+        # Four clusters are few: the levels are beyond 2.5 %, so that the limits lie near the ends.
+        if found is not None:
+            assert found[0] <= np.quantile(means, 0.025) + 1e-9
+            assert found[1] >= np.quantile(means, 0.975) - 1e-9
+
+
+class TestDifferences:
+    def test_they_are_those_of_compare(self, results: Results) -> None:
+        figure = differences_figure(results)
+        table = compare([results.folder], baseline="late").overall.set_index(["configuration", "metric"])
+        assert rows(figure.axes[0]) == ["half", "hit", "never"], "the truth is no row"
+        for axes, metric, times in zip(figure.axes, ("ttd_rmst_s", "pass_share"), (1, 100), strict=True):
+            assert dots(axes), metric
+            for name, (value, filled) in dots(axes).items():
+                row = table.loc[(name, metric)]
+                assert value == pytest.approx(times * row["difference"], abs=1e-9)
+                assert filled == (name in intervals(axes)) == (not pd.isna(row["low"]))
+                if filled:
+                    assert intervals(axes)[name] == pytest.approx((times * row["low"], times * row["high"]), abs=1e-9)
+            bold = [text.get_text() for text in axes.texts if text.get_fontweight() == "bold"]
+            sure = [
+                name for name in dots(axes) if table.loc[(name, metric), "low"] * table.loc[(name, metric), "high"] > 0
+            ]
+            assert len(bold) == len(sure)
+        assert "The ground truth, an upper bound, is not drawn: GT −0.5 " in note(figure)
+
+    def test_a_report_has_its_own_baseline(self, results: Results) -> None:
+        found = compare([results], baseline="hit")
+        figure = FIGURES["differences"].draw(results, Selection(differences=found))
+        assert rows(figure.axes[0]) == ["half", "late", "never"]
+
+    def test_with_nothing_to_compare_there_is_none(self, tmp_path: Path) -> None:
+        alone = load_results(replayed(tmp_path, changed(ONE, *ALONE)))
+        assert FIGURES["differences"].missing(alone, Selection()) == ""
+        with pytest.raises(InputError, match="there is nothing to compare with"):
+            differences_figure(alone)
+
+    def test_a_missing_interval_is_said_first(self, two: Results) -> None:
+        assert note(differences_figure(two)).startswith("No intervals: 2 objects. ")
+
+
+class TestTradeOff:
+    def test_a_mark_and_a_name_each(self, many: Results) -> None:
+        (axes,) = trade_off_figure(many).axes
+        summary = many.summary.set_index("configuration")
+        marks = {str(c.get_label()): tuple(c.get_offsets()[0]) for c in axes.collections}
+        known = summary[["position_rmse_m", "false_positives_per_min"]].dropna().drop(index="GT")
+        assert set(marks) == set(known.index)
+        for name, place in marks.items():
+            assert place == pytest.approx(tuple(known.loc[name]))
+        assert sorted(text.get_text() for text in axes.texts) == sorted(known.index)
+
+    def test_names_do_not_cover_each_other(self, many: Results) -> None:
+        figure = trade_off_figure(many)
+        figure.draw_without_rendering()
+        boxes = [text.get_window_extent() for text in figure.axes[0].texts]
+        inside = [box for box in boxes if math.isfinite(box.x0)]
+        # An annotation's extent has its line in it: text alone is what is beside the mark.
+        texts = [super(type(text), text).get_window_extent() for text in figure.axes[0].texts]
+        assert len(inside) == len(texts) == 18
+        assert not [1 for k, one in enumerate(texts) for other in texts[:k] if one.overlaps(other)]
+
+    def test_of_ideal_fusion_alone_there_is_none(self, results: Results, many: Results) -> None:
+        assert FIGURES["trade_off"].missing(results, Selection()) == ""
+        assert FIGURES["trade_off"].missing(many, Selection()) is None
+
+
+class TestEighteen:
+    def test_never_more_than_twelve_lines_and_those_left_out_are_named(self, many: Results) -> None:
+        every = tuple(many.experiment.configurations)
+        assert len(every) == 19
+        figure = curves_figure(many)
+        shown = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert len(shown) <= 12
+        left = [name for name in every if name not in shown]
+        assert (
+            f"{len(shown)} of 19 configurations, from the soonest to the latest; not drawn: {', '.join(left)}."
+            in note(figure)
+        )
+
+    def test_each_has_a_panel_of_its_own(self, many: Results) -> None:
+        shown = [axes for axes in one_by_one_figure(many).axes if axes.get_visible()]
+        assert [axes.get_title(loc="left").partition(":")[0] for axes in shown] == list(many.experiment.configurations)
+
+    def test_each_has_a_row(self, many: Results) -> None:
+        every = set(many.experiment.configurations)
+        assert set(rows(answer_figure(many).axes[0])) == every - {"GT"}
+        assert set(rows(differences_figure(many).axes[0])) == every - {"GT", "c00"}
+
+    def test_those_that_detect_alike_count_once(self, many: Results) -> None:
+        table = many.table.copy()
+        keys = ["log", "object_id", "run"]
+        first = table[table["configuration"] == "c00"].set_index(keys)["time_to_detection_s"]
+        alike = table["configuration"].isin([f"c{k:02}" for k in range(10)])
+        table.loc[alike, "time_to_detection_s"] = first.reindex(
+            pd.MultiIndex.from_frame(table.loc[alike, keys])
+        ).to_numpy()
+        changed_one = Results(many.folder, many.seen, many.provenance)
+        changed_one.__dict__["table"] = table
+        names = tuple(many.experiment.configurations)
+        found = that_differ(changed_one, names)
+        assert set(found) & {f"c{k:02}" for k in range(10)} == {"c00"}
+        assert that_differ(many, names[:12]) == names[:12]
+
+    def test_the_page_is_small(self, many: Results) -> None:
+        assert len(report_page(load_study(many.folder)).encode()) < 1_500_000
+
+
+class TestWhichObject:
+    @given(st.data())
+    @settings(max_examples=80, deadline=None)
+    def test_the_same_as_in_the_viewer(self, data: st.DataObject) -> None:
+        """Of one log: the one object that the viewer would choose."""
+        objects, names = data.draw(st.integers(1, 5)), ("GT", "A", "B")
+        table = pd.DataFrame(
+            [("x", str(o), name) for name in names for o in range(objects)],
+            columns=["log", "object_id", "configuration"],
+        )
+        times = st.one_of(st.none(), st.integers(0, 3).map(float))
+        table["time_to_detection_s"] = [data.draw(times) for _ in range(len(table))]
+        table["time_to_detection_s"] = table["time_to_detection_s"].astype(float)
+        table["onset_s"], table["ended_s"] = 0.0, 4.0
+        table["conflict"] = [data.draw(st.booleans())] * len(table)
+        assert most_telling(table, ("GT",)) == ("x", telling(table, ("GT",), 1)[0])
+
+    def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results) -> None:
+        """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
+        assert choose(two).object_id == "2"
+        without = Results(two.folder, two.seen, two.provenance)
+        table = two.table.drop(columns="conflict")
+        run = int(table.loc[table["configuration"] == "half"].sort_values("time_to_detection_s")["run"].iloc[-1])
+        of_run = table[(table["run"] == run) & (table["configuration"] != "GT")]
+        late_s = of_run["time_to_detection_s"].fillna(of_run["ended_s"] - of_run["onset_s"])
+        spread = late_s.groupby(of_run["object_id"]).agg(lambda s: s.max() - s.min())
+        without.__dict__["table"] = table
+        chosen = choose(without, run=run)
+        assert spread[chosen.object_id] == spread.max()
+        assert chosen.configurations == tuple(two.experiment.configurations)
+
+
+class TestLooks:
+    def test_colours_are_those_of_the_recording(self) -> None:
+        names = [f"c{k}" for k in range(21)]
+        colours = configuration_colours(names)
+        for name, look in appearances(names).items():
+            assert tuple(round(255 * channel) for channel in look.colour) == colours[name]
+
+    def test_lines_are_seen_on_white_and_on_a_dark_page(self) -> None:
+        """WCAG 2.1, 1.4.11: 3 to 1, by the colour itself or by its outline."""
+        for look in appearances([f"c{k}" for k in range(21)]).values():
+            for paper in (WHITE, DARK):
+                assert max(contrast(look.colour, paper), contrast(look.edge, paper)) >= 3, look
+
+    def test_contrast(self) -> None:
+        assert contrast((0.0, 0.0, 0.0), WHITE) == pytest.approx(21)
+        assert contrast(WHITE, WHITE) == pytest.approx(1)
+        grey = 0x76 / 255  # the greys around it are known to end at 4.5
+        assert contrast((grey,) * 3, WHITE) == pytest.approx(4.54, abs=0.01)
+
+
+def test_numbers_have_three_digits() -> None:
+    shown = {
+        0: "0",
+        1e-12: "0",
+        0.012345: "0.0123",
+        0.99963: "1",
+        12.345: "12.3",
+        999.4: "999",
+        15371.2: "15371",
+        -0.5: "−0.5",
+    }
+    assert {value: plain(value) for value in shown} == shown
+    shares = {0.0: "0", 1.0: "100", 0.844: "84.4", 0.99963: "> 99.9", 0.0001: "< 0.1", 0.9924: "99.2"}
+    assert {value: per_cent(value) for value in shares} == shares
+    assert per_cent(math.nan) == "–"
+
+
+def test_headers_have_units_also_of_own_metrics() -> None:
+    own = {
+        "speed_rmse_mps": "speed rmse, m/s",
+        "late_share": "late, %",
+        "calls_per_min": "calls per minute",
+        "cost": "cost",
+    }
+    assert {name: header(name) for name in own} == own
+    assert without_unit("ttd_rmst_s") == "mean time to detection"
+    assert difference_header("pass_share") == "passes, percentage points"
+    assert (number("late_share", 0.5), number("cost", math.nan)) == ("50", "–")
+    assert [signed_difference("late_share", value) for value in (0.125, -0.5, 1e-12)] == ["+12.5", "−50", "±0"]
+    assert in_order(["n", "detected_share", "ttd_rmst_s"]) == ["ttd_rmst_s", "detected_share", "n"]
+
+
+def test_greys_turn_over_and_colours_stay() -> None:
+    """Black becomes the ink of the dark page, white its paper, a grey lies as far between them."""
+    page = as_variables('<path style="fill: #ffffff; stroke: #000000"/><path style="fill: #808080; stroke: #0072b2"/>')
+    assert "#0072b2" in page
+    assert re.findall(r"#[0-9a-f]{6}", page) == ["#0072b2"]
+    light, dark = dark_greys(page).splitlines()
+    assert light == ":root{--g-00:#000000;--g-80:#808080;--g-ff:#ffffff;}"
+    expected = ":root{--g-00:#e8e8e8;--g-80:#818181;--g-ff:#1b1b1b;}"
+    assert dark == f"@media screen and (prefers-color-scheme: dark){{{expected}}}"
+    assert dark_greys("<p>no figure</p>") == ""
+
+
+def test_the_page_has_the_dark_paper_that_greys_go_by() -> None:
+    css = (files("copem_replay.report.html") / "page.css").read_text(encoding="utf-8")
+    dark = css[css.index("prefers-color-scheme: dark") :]
+    for name, colour in (("ink", INK), ("paper", PAPER)):
+        found = re.search(rf"--{name}: #([0-9a-f]{{6}})", dark)
+        assert found is not None
+        assert bytes.fromhex(found[1]) == bytes(colour)
+    assert tuple(round(255 * channel) for channel in DARK) == PAPER
+
+
+def test_coordinates_are_rounded_to_a_hundredth_of_a_point(results: Results) -> None:
+    """As matplotlib writes them, but for what nobody sees."""
+    with style():
+        figure = answer_figure(results)
+        lay_out(figure)
+        file = BytesIO()
+        figure.savefig(file, format="svg")
+    ours = rendered(answer_figure(results), (".svg",))[".svg"].decode()
+    paths = [re.findall(r' d="([^"]*)"', svg) for svg in (file.getvalue().decode(), ours)]
+    assert len(paths[0]) == len(paths[1]) > 20
+    for exact, rounded in zip(*paths, strict=True):
+        numbers = [[float(n) for n in re.findall(r"-?[\d.]+", path)] for path in (exact, rounded)]
+        assert numbers[1] == pytest.approx(numbers[0], abs=0.0051)
+    assert len(ours) < len(file.getvalue())
