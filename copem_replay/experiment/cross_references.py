@@ -139,6 +139,10 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
         yield source.at(("sweep", "penetration_rate"), "no unit is `on: {classes, penetration_rate}`")
     if sweep.get("rate_hz") and not units:
         yield source.at(("sweep", "rate_hz"), "the experiment has no units")
+    if sweep.get("ghosts_in_list") and not any(
+        isinstance(pem, dict) and pem.get("ghosts") for _, pem in _items(data.get("pems"))
+    ):
+        yield source.at(("sweep", "ghosts_in_list"), "no PEM has `ghosts: […]`")
     if sweep.get("correlation_s") and not any(_memories(data, name, "detection") for name in _names(data.get("pems"))):
         yield source.at(("sweep", "correlation_s"), "no PEM has `memory: {detection: […]}`")
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")

@@ -17,6 +17,7 @@ from copem_replay.fusion.base import Fusion, Ideal
 from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
+from copem_replay.perception.pem.ghosts import MeanNumber
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Surface, Visibility
 
@@ -157,6 +158,7 @@ class SweptBy(Frozen):
     units: SweptNames | None = None
     penetration_rate: SweptNames | None = None
     correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+    ghosts_in_list: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
 
 
 def _swept_by(value: object) -> str:
@@ -173,7 +175,7 @@ class Sweep(Frozen):
     `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
     `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
     how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
-    every list.
+    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average.
     """
 
     configurations: Swept | None = None
@@ -182,6 +184,9 @@ class Sweep(Frozen):
     units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
+    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
         default=None, exclude_if=lambda values: values is None
     )
 

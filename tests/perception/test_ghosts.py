@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,12 +13,15 @@ from scipy import stats
 
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.perceive import with_states
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
+from copem_replay.pipeline.sweep import points
 from tests.helpers import scenes
+from tests.helpers.experiments import changed, source_of
 from tests.helpers.scenes import SEES_60_M, Thing, driving, experiment, standing
 
 FIELD = {"kind": "field", "range_m": [3, 60], "azimuth_deg": [-60, 60]}
@@ -235,3 +239,32 @@ def test_errors_of_the_couple_that_applies() -> None:
     assert off_m[~near].std() == pytest.approx(3.0, rel=0.1)
     assert listed.cov_ee_m2 is not None
     assert (listed.cov_ee_m2[0] == np.where(near, 1.0, 9.0)).all()
+
+
+class TestSweep:
+    PLAN: ClassVar = {"in_list": 0.2, "lasts_s": 0.7, "where": FIELD, "classes": {"car": 1.0}}
+
+    def test_of_the_first_sort_only_and_of_fusions_that_hear_of_them(self) -> None:
+        others = {"in_list": 0.1, "where": FIELD}
+        plan = plan_of(self.PLAN, others, sweep={"ghosts_in_list": [0, 0.5]})
+        swept = list(points(plan))
+        assert [(point.sweep, point.value, list(point.experiment.configurations)) for point in swept] == [
+            ("ghosts_in_list", 0.0, ["gnn"]), ("ghosts_in_list", 0.5, ["gnn"]),
+        ]  # fmt: skip
+        assert [[sort.in_list for sort in point.experiment.pems["eyes"].ghosts] for point in swept] == [
+            [0.0, 0.1], [0.5, 0.1],
+        ]  # fmt: skip
+
+    def test_rows_are_those_of_an_experiment_with_so_many(self) -> None:
+        recording = scene_of(Thing("car", "car", driving(55, 0, -8)), until_s=5)
+        changes: dict[str, Any] = {"runs": 3, "pem": {"couples": TestWhatTheyLeave.NOISE}}
+        swept = run(plan_of(self.PLAN, sweep={"ghosts_in_list": [0, 3]}, **changes), [recording]).sweep
+        assert swept is not None
+        assert swept[["sweep", "value"]].values.tolist() == [["ghosts_in_list", 0.0], ["ghosts_in_list", 3.0]]
+        alone = run(plan_of(self.PLAN | {"in_list": 3.0}, **changes), [recording]).summary.set_index("configuration")
+        for column in ("detected_share", "ttd_rmst_s", "list_rate_hz"):
+            assert swept[column].iloc[1] == alone[column]["gnn"], column
+
+    def test_without_any(self, tmp_path: Path) -> None:
+        _, said = problems(source_of(tmp_path, changed("sweep: {ghosts_in_list: [0, 1]}")))
+        assert [line.partition(": ")[2] for line in said] == ["sweep.ghosts_in_list: no PEM has `ghosts: […]`"]

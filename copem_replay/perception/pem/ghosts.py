@@ -86,6 +86,10 @@ PLACES = {
 }
 
 
+MeanNumber = Annotated[float, Field(strict=True, ge=0, le=1000)]
+"""How many there are on average."""
+
+
 class Ghosts(Frozen):
     """One sort of ghosts: `in_list` of them in a list on average (Poisson), each for `lasts_s` (exponential).
 
@@ -94,7 +98,7 @@ class Ghosts(Frozen):
     such objects are measured). `existence`: what the unit claims of it, left out: as the couple that applies.
     """
 
-    in_list: Annotated[float, Field(strict=True, ge=0, le=1000)]
+    in_list: MeanNumber
     lasts_s: Annotated[float, Field(strict=True, ge=0, le=86_400)] = 0.0
     where: Annotated[GhostPlace, Slot("ghosts", PLACES)]
     classes: Shares = Field(default_factory=lambda: {"pedestrian": 1.0})
