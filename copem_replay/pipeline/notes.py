@@ -9,7 +9,7 @@ import numpy as np
 
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import Ideal
@@ -17,6 +17,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
+from copem_replay.perception.pem.ghosts import Beside
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.prepare import Replay
@@ -75,6 +76,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})"
     yield from _clocks(experiment)
+    yield from _beside_nobody(replay, experiment)
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
@@ -89,6 +91,15 @@ def _clocks(experiment: Experiment) -> Iterator[str]:
         off = [unit for unit in experiment.units_of(configuration) if experiment.units[unit].clock is not None]
         if off and isinstance(configuration.fusion, Ideal):
             yield f"configuration {name}: ideal fusion goes by true captures and ignores the clock of {', '.join(off)}"
+
+
+def _beside_nobody(replay: Replay, experiment: Experiment) -> Iterator[str]:
+    """Ghosts beside objects that the log does not have."""
+    there = set(replay.scene.object_class.tolist())
+    for name, pem in experiment.pems.items():
+        for n, sort in enumerate(pem.ghosts):
+            if isinstance(sort.where, Beside) and not there & set(class_indices(sort.where.classes).tolist()):
+                yield f"pems.{name}.ghosts[{n}].where: beside: no {' or '.join(sort.where.classes)} in this log"
 
 
 def could_meet(replay: Replay) -> Bool:

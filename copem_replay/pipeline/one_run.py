@@ -63,6 +63,8 @@ class RunTracks:
                 else:
                     matches = match_lists(around, one, self.experiment.measure)
                     result[name] = as_fused_tracks(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
+                if one.faults is not None:
+                    result[name] = replace(result[name], faults=one.faults)
             yield result
 
 

@@ -17,6 +17,7 @@ from copem_replay.core.object_list import ObjectLists, TellsOf
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.time_chunk import WHOLE, TimeChunk
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
+from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
@@ -63,7 +64,7 @@ class ReceiverOutput:
     `fused_tracks`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without
     truth ids, or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell;
     `whole`: the instants are those of the whole log, not of a time chunk. `stated`: what a fusion was told of captures,
-    in one run; None: the truth.
+    in one run; None: the truth. `faults`: what of the lists is false or missing in it, where units have such.
     """
 
     heard: Tracks
@@ -74,6 +75,7 @@ class ReceiverOutput:
     tells_of: TellsOf = "capture"
     whole: bool = True
     stated: StatedCaptures | None = None
+    faults: UnitFaults | None = None
 
     @cached_property
     def lists(self) -> ObjectLists:
@@ -187,6 +189,9 @@ class Receivers:
             heard = listen(seen_in(states), world.truth, experiment, name, self._there)
             if name not in self._schedules:
                 self._schedules[name] = fusion_schedule(heard, max_age_s=max_age_s)
+            faults = None if of_truth else _faults(world, seen_in(states), None if posterior else ghosts)
+            if isinstance(fusion, Ideal) and faults is not None:
+                faults = replace(faults, ghosts=faults.ghosts[:0])  # it knows them for what they are
             at = self._schedules[name].between(world.chunk.from_s, world.chunk.until_s)
             whole = world.chunk == WHOLE
             if isinstance(fusion, ListFusion):
@@ -204,14 +209,14 @@ class Receivers:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
                 else:  # such a log is one time chunk
                     fused = fused_by(fusion, told, where)
-                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole, stated)
+                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole, stated, faults)
                 continue
             fused_tracks = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
             if not of_truth and world.recorded is None:
                 fused_tracks = replace(fused_tracks, view=world.found.view)
             if posterior:
                 fused_tracks = draw_posterior(fused_tracks, world.scene, experiment.seed, self._runs)
-            yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole)
+            yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole, faults=faults)
 
     def _ghosts(self, world: WorldChunk) -> GhostRows | None:
         """What units list of nobody, where a block has one run and there is a fusion that would not know better."""
@@ -224,6 +229,15 @@ class Receivers:
 def receive(world: WorldChunk, runs: Int, there: Bool | None) -> Iterator[tuple[str, ReceiverOutput]]:
     """What each configuration's receiver issues in a whole log."""
     return Receivers(runs, there).receive(world)
+
+
+def _faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFaults | None:
+    """What of the lists of one run is false or missing; None: no unit has such."""
+    if ghosts is None and not world.experiment.outages:
+        return None
+    first = len(world.found.tracks.frame_ix)
+    rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
+    return UnitFaults(rows, np.isinf(seen.arrives_s[0]))
 
 
 def _without_truth(world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None) -> ObjectLists:
