@@ -206,6 +206,11 @@ class Slot:
             raise _problem(f"kind: {value['kind']!r} cannot be made: {failed(error, component)}") from error
 
 
+def at_key(key: str, message: str) -> ValidationError:
+    """The error that what stands at a key of a model is wrong, for the model's own validators to raise."""
+    return ValidationError.from_exception_data("key", [{"type": _problem(message), "loc": (key,), "input": key}])
+
+
 def _problem(message: str) -> PydanticCustomError:
     # The message is a constant to pydantic: braces of the text must not be read as fields.
     return PydanticCustomError("component", "{message}", {"message": message})

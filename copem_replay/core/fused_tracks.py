@@ -12,6 +12,7 @@ import numpy as np
 from copem_replay.core.agree import most_probable_of_each
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.core.view_geometry import ViewGeometry
 
 if TYPE_CHECKING:  # it takes long to import
@@ -37,6 +38,7 @@ class FusedTracks:
     view: ViewGeometry | None = None  # how the rows of `heard` look from their units; the truth needs none
     said: Entries | None = None
     scene: Scene | None = None  # of the log, where rows are to be named
+    faults: UnitFaults | None = None  # of `heard`, in one run: where a unit has outages or ghosts
 
     def to_dataframe(self) -> pd.DataFrame:
         """The entries of all lists of one run, in the order of the lists.

@@ -74,6 +74,12 @@ def _braking(source: Source, data: dict[str, Any]) -> Iterator[str]:
             yield source.at(
                 ("measure", "exact"), f"unit {recorded[0]!r} is recorded: nothing says how probable its lists were"
             )
+        off = [name for name, unit in _items(data.get("units")) if unit.get("outages") is not None]
+        if off:
+            yield source.at(
+                ("measure", "exact"),
+                f"unit {off[0]!r} has outages, in which all objects miss all lists together: that has no closed form",
+            )
     if measure.get("exact") is True and isinstance(confirm, dict):
         of = confirm.get("of", 1)
         if isinstance(of, int) and confirm.get("hits", 1) != 1 and of > LONGEST_CHAIN:
@@ -134,6 +140,10 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
         yield source.at(("sweep", "penetration_rate"), "no unit is `on: {classes, penetration_rate}`")
     if sweep.get("rate_hz") and not units:
         yield source.at(("sweep", "rate_hz"), "the experiment has no units")
+    if sweep.get("ghosts_in_list") and not any(
+        isinstance(pem, dict) and pem.get("ghosts") for _, pem in _items(data.get("pems"))
+    ):
+        yield source.at(("sweep", "ghosts_in_list"), "no PEM has `ghosts: […]`")
     if sweep.get("correlation_s") and not any(_memories(data, name, "detection") for name in _names(data.get("pems"))):
         yield source.at(("sweep", "correlation_s"), "no PEM has `memory: {detection: […]}`")
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
@@ -210,10 +220,11 @@ def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: obj
 
 
 def _remembers(data: dict[str, Any], chosen: object) -> bool:
-    """Whether a draw of any PEM of a configuration's units lasts."""
+    """Whether any draw of a configuration's units lasts, of their PEMs or of their own poses."""
     named = map(str, chosen) if isinstance(chosen, list) else _modelled(data) if chosen == "all" else ()
     units = dict(_items(data.get("units")))
-    return any(_memories(data, str(units.get(name, {}).get("pem"))) for name in named)
+    heard = [units.get(name, {}) for name in named]
+    return any(unit.get("placed") is not None or _memories(data, str(unit.get("pem"))) for unit in heard)
 
 
 def _memories(data: dict[str, Any], name: str, quantity: str | None = None) -> list[dict[str, Any]]:

@@ -22,12 +22,13 @@ from pydantic import (
 )
 
 from copem_replay.communication.link import ConstantLink, LinkModel
-from copem_replay.core.components import Count, Frozen, Id, Positive, Share, Slot, described
+from copem_replay.core.components import Count, Frozen, Id, Positive, Share, Slot, at_key, described
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
 from copem_replay.io.config import Ego, HowRead, Latency, Read, Recorded, WindowOf
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
+from copem_replay.perception.pem.ghosts import MeanNumber
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Surface, Visibility
 
@@ -61,6 +62,13 @@ UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 
 
+_NOT_RECORDED = {
+    "placed": "is where its lists say",
+    "clock": "captures when its lists say",
+    "outages": "makes the lists that are recorded",
+}
+
+
 class Unit(Placement):
     """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
@@ -77,6 +85,9 @@ class Unit(Placement):
         if (self.pem is None) == (self.recorded is None):
             raise ValueError("expected one of `pem: <name>` and `recorded: {topic: …}`")
         if self.recorded is not None:
+            for key, why in _NOT_RECORDED.items():
+                if getattr(self, key) is not None:
+                    raise at_key(key, f"a recorded unit {why}; only for units with a pem")
             if self.rate_hz is not None or isinstance(self.on, Carriers) or (self.on and self.at):
                 raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
             return self
@@ -158,6 +169,7 @@ class SweptBy(Frozen):
     units: SweptNames | None = None
     penetration_rate: SweptNames | None = None
     correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+    ghosts_in_list: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
 
 
 def _swept_by(value: object) -> str:
@@ -174,7 +186,7 @@ class Sweep(Frozen):
     `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
     `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
     how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
-    every list.
+    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average.
     """
 
     configurations: Swept | None = None
@@ -183,6 +195,9 @@ class Sweep(Frozen):
     units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
+    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
         default=None, exclude_if=lambda values: values is None
     )
 

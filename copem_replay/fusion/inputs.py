@@ -52,14 +52,22 @@ def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[
     return ObjectLists(start, entries), run, picked
 
 
-def inputs(heard: Tracks, lists: ObjectLists, *, max_age_s: float, at: FusionSchedule | None = None) -> Inputs:
+def inputs(
+    heard: Tracks,
+    lists: ObjectLists,
+    *,
+    max_age_s: float,
+    at: FusionSchedule | None = None,
+    captured_s: Float | None = None,
+) -> Inputs:
     """The same lists as one configuration's receiver has them: when each arrives, and which it goes by when.
 
-    `at`: some of the instants.
+    `at`: some of the instants. `captured_s (F,)`: when they were captured, as fusion is told; None: the truth.
     """
     at = at or fusion_schedule(heard, max_age_s=max_age_s)
+    captured_s = heard.captured_s if captured_s is None else captured_s
     return Inputs(
-        heard.units, heard.frame_unit_ix, heard.captured_s, heard.arrives_s[0], lists,
+        heard.units, heard.frame_unit_ix, captured_s, heard.arrives_s[0], lists,
         at.issue_s, at.newest, at.arrived, at.arrived_start,
     )  # fmt: skip
 

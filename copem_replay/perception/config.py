@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from copem_replay.core.components import Frozen, Id, NotNegative, Number, Positive, Share
 from copem_replay.perception.pem.condition import ClassNames
+from copem_replay.perception.unit_errors import Clock, Outages, PoseError
 from copem_replay.perception.visibility import VisibilityModel
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], 
 class Placement(Frozen):
     """Carried `on` the ego, another object or a share of some classes, or standing `at` a place; lists at some rate.
 
-    `height_m` above the ground; left out, a carried unit is on the roof.
+    `height_m` above the ground; left out, a carried unit is on the roof. `placed`: how wrong the unit is about its own
+    pose, `clock`: about the time, `outages`: when it makes no lists.
     """
 
     on: On | None = None
@@ -62,6 +64,9 @@ class Placement(Frozen):
     pem: Id | None = None
     rate_hz: Rate | None = None
     phase_s: NotNegative = 0.0
+    placed: PoseError | None = Field(default=None, exclude_if=lambda placed: placed is None)
+    clock: Clock | None = Field(default=None, exclude_if=lambda clock: clock is None)
+    outages: Outages | None = Field(default=None, exclude_if=lambda outages: outages is None)
 
 
 _AROUND = "the corners in order around an area, each once"

@@ -19,6 +19,7 @@ from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import applies
 from copem_replay.perception.pem.detection import probability_of
+from copem_replay.perception.pem.scores import Scores
 from copem_replay.perception.sensor_poses import SensorPoses, UnitPoses, observers, place
 from copem_replay.perception.visibility import visible_shares
 
@@ -231,7 +232,8 @@ def _assess(tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup) -> 
                 where = f"pems.{unit.pem}[{c}].detection"
                 probability[mine] = probability_of(couple.detection, view.take(mine), where)
                 claimed = couple.existence
-                existence[mine] = view.visible_share[mine] if claimed == "visible_share" else claimed
+                if not isinstance(claimed, Scores):  # those are drawn of each run: perception/claims.py
+                    existence[mine] = view.visible_share[mine] if claimed == "visible_share" else claimed
     return couple_ix, probability, existence
 
 

@@ -21,6 +21,7 @@ from copem_replay.perception.draws import Draws
 from copem_replay.perception.observation import Observations, rows_by_unit
 from copem_replay.perception.pem.error import errors_of
 from copem_replay.perception.pem.memory import Part, Parts, quantity_of
+from copem_replay.perception.pose_error import misplaced
 
 SMALLEST_SIZE_M = 0.05
 """A size error never makes a box smaller than this (chosen)."""
@@ -41,6 +42,18 @@ def perceive(
     detection times by truth id need), the expected ones (true state plus the mean error) or sampled. What was listed
     does not depend on `states`.
     """
+    tracks, draws = found.tracks, draws_of(scene, found, experiment, runs)
+    valid = _listed(found, experiment, draws)
+    if equipped is not None:
+        valid &= equipped[:, tracks.row_unit_ix]
+    seen = replace(tracks, valid=valid)
+    if states == "true":
+        return seen
+    return with_states(scene, seen, found, experiment, None if states == "expected" else draws)
+
+
+def draws_of(scene: Scene, found: Observations, experiment: PerceptionSetup, runs: Int) -> Draws:
+    """The numbers of the rows of objects (P,) in the runs (S,)."""
     tracks = found.tracks
     random_key = RandomKey(
         tracks.units,
@@ -49,14 +62,15 @@ def perceive(
         tracks.stamp_ns[tracks.frame_ix],
     )
     lists = ListTimes(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
-    draws = Draws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
-    valid = _listed(found, experiment, draws)
-    if equipped is not None:
-        valid &= equipped[:, tracks.row_unit_ix]
-    seen = replace(tracks, valid=valid)
-    if states == "true":
-        return seen
-    return _with_errors(seen, found, experiment, None if states == "expected" else draws)
+    return Draws(CounterRng(experiment.seed, scene.log), random_key, lists, runs)
+
+
+def with_states(
+    scene: Scene, seen: Tracks, found: Observations, experiment: PerceptionSetup, draws: Draws | None
+) -> Tracks:
+    """What was listed with the errors of its couples and of the units' poses; `draws` None: the expected ones."""
+    seen = _with_errors(seen, found, experiment, draws)
+    return seen if draws is None else misplaced(scene, seen, found.tracks, found.view, experiment, draws.runs)
 
 
 def _listed(found: Observations, experiment: PerceptionSetup, draws: Draws) -> Bool:

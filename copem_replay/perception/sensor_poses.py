@@ -25,6 +25,7 @@ class UnitPoses:
     z_m: Float  # of the sensor itself
     heading_rad: Float
     present: Bool
+    ground_m: Float  # under it
 
 
 @dataclass(frozen=True)
@@ -73,20 +74,22 @@ def poses(scene: Scene, unit: Placement, world: Tracks, ground_m: float) -> Unit
         heading = np.full(n, wrap(np.deg2rad(np.array(unit.yaw_deg))))
         assert unit.height_m is not None  # the experiment says so
         x, y, z = (np.full(n, v) for v in (*unit.at, ground_m + unit.height_m))
+        ground = np.full(n, ground_m)
         x, y = moved(x, y, heading, unit.offset_m)
         present = np.ones(n, dtype=bool)
     else:
-        x, y, z, yaw = (np.full(n, np.nan) for _ in range(4))
+        x, y, z, yaw, ground = (np.full(n, np.nan) for _ in range(5))
         rows = np.flatnonzero(world.row_object_ix == carrier(scene, unit))
         at = world.frame_ix[rows]
         present = np.zeros(n, dtype=bool)
         present[at] = True
         x[at], y[at], yaw[at] = world.x_m[0, rows], world.y_m[0, rows], world.yaw_rad[0, rows]
         height_m = world.height_m[0, rows] if unit.height_m is None else unit.height_m  # on the roof
-        z[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2 + height_m
+        ground[at] = world.z_m[0, rows] - world.height_m[0, rows] / 2
+        z[at] = ground[at] + height_m
         x, y = moved(x, y, yaw, unit.offset_m)
         heading = wrap(yaw + np.deg2rad(unit.yaw_deg))
-    return UnitPoses(x, y, z, heading, present)
+    return UnitPoses(x, y, z, heading, present, ground)
 
 
 def moved(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[float, float]) -> tuple[Float, Float]:

@@ -97,10 +97,10 @@ class AccuracyTables:
     bands: pd.DataFrame
 
 
-def accuracy_tables(outcomes: Sequence[Outcome], order: Int, *, same_units: bool) -> AccuracyTables:
+def accuracy_tables(outcomes: Sequence[Outcome], order: Int, *, same_instants: bool) -> AccuracyTables:
     """All tables of runs of several logs, `order (n,)` being that of the rows of all outcomes in `detections`."""
-    per_list = _per_list(outcomes).take(pa.array(order)) if same_units else None
-    instants = _instants(outcomes) if same_units else None
+    per_list = _per_list(outcomes).take(pa.array(order)) if same_instants else None
+    instants = _instants(outcomes) if same_instants else None
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
     return AccuracyTables(per_list, instants, _lists(outcomes), _thresholds(outcomes, place), bands(outcomes))

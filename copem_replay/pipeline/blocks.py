@@ -92,10 +92,14 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
     presence = Presence.of(replay.expanded, replay.scene.log, runs)
     measure = experiment.measure
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_all(experiment)
-    if by_entry:
+    units = replay.expanded.with_(experiment)
+    if by_entry and not units.outages:
         return [_block(replay, experiment, runs, presence)]
     # Which lists there are decides what is consecutive: runs with the same units go together.
-    return [_block(replay, experiment, *part) for part in presence.parts(runs)]
+    parts = list(presence.parts(runs))
+    if units.runs_apart:
+        parts = [(part[k : k + 1], alike) for part, alike in parts for k in range(len(part))]
+    return [_block(replay, experiment, *part) for part in parts]
 
 
 def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence) -> Outcome:
@@ -108,7 +112,7 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence
     if everything or measure.conflict is not None:
         receivers = Receivers(runs, presence.sending)
         judges: dict[str, _Judge] = {}
-        for world in replay.worlds(experiment, presence.sending, measured_only=not everything):
+        for world in replay.worlds(experiment, runs, presence.sending, measured_only=not everything):
             around = replay.truth_cache_of(world.chunk)
             for name, output in receivers.receive(world):
                 if name not in judges:

@@ -20,6 +20,7 @@ from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import ListFusion
 from copem_replay.perception.sensor_poses import list_instants
 from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.stated_captures import StatedCaptures
 
 ROWS_AT_ONCE = 500_000
 """A log with at most so many observation rows is one time chunk (chosen: shown, too, it takes about 1 GB)."""
@@ -61,10 +62,16 @@ def _can_be_cut(configurations: Iterable[Configuration]) -> bool:
 class Reach:
     """How early a list may have been captured that is gone by at an instant of a time chunk, or needed once more.
 
-    `heard`: by configuration the lists that its receiver hears, whatever is in them.
+    `heard`: by configuration the lists that its receiver hears, whatever is in them; `stated`: what their units say of
+    the captures, where that is not the truth.
     """
 
-    def __init__(self, experiment: ExpandedExperiment, heard: Mapping[str, Tracks]) -> None:
+    def __init__(
+        self,
+        experiment: ExpandedExperiment,
+        heard: Mapping[str, Tracks],
+        stated: Mapping[str, StatedCaptures | None] | None = None,
+    ) -> None:
         self._oldest: list[tuple[Float, Float]] = []  # instants, and the oldest capture that each needs
         self._again: list[tuple[Float, Float]] = []
         for name, configuration in experiment.configurations.items():
@@ -79,8 +86,11 @@ class Reach:
             fusion = configuration.fusion
             if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
                 arrives_s, captured_s = mine.arrives_s[0, at.arrived], mine.captured_s[at.arrived]
+                ahead_s = 0.0
+                if stated is not None and (told := stated[name]) is not None:  # it looks back by what it is told
+                    captured_s, ahead_s = told.stated_s[at.arrived], told.ahead_s
                 newest_s = np.maximum.accumulate(captured_s)
-                self._again.append((arrives_s, newest_s - fusion.looks_back_s - AROUND_S))
+                self._again.append((arrives_s, newest_s - ahead_s - fusion.looks_back_s - AROUND_S))
 
     def earliest_s(self, chunk: TimeChunk) -> float:
         """The earliest capture that a time chunk needs."""

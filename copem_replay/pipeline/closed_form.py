@@ -63,6 +63,8 @@ def _check_truth_ids(experiment: Experiment) -> None:
             why = "what is matched with the truth depends on sampled errors"
         elif recorded:
             why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"
+        elif off := [n for n in experiment.units_of(configuration) if experiment.units[n].outages is not None]:
+            why = f"unit {off[0]} has outages, in which all objects miss all lists together"
         else:
             continue
         raise ExperimentError(f"exact: configuration {name}: {why}, which has no closed form; leave `exact` out")

@@ -14,6 +14,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.fusion.base import ListFusion
 from copem_replay.io.config import Recorded
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle
@@ -98,6 +99,28 @@ class ExpandedExperiment:
     def same_in_all_runs(self) -> bool:
         """Whether all runs have the same units."""
         return bool((self.share == 1).all())
+
+    @property
+    def outages(self) -> bool:
+        """Whether a unit at times makes no lists: each run then has lists, and instants, of its own."""
+        return any(unit.outages is not None for unit in self.modelled.values())
+
+    @property
+    def runs_apart(self) -> bool:
+        """Whether lists differ from run to run in more than the states of their rows: a block then has one run."""
+        return self.outages or any(
+            isinstance(configuration.fusion, ListFusion)
+            and any(self._apart(self.units[name]) for name in self.units_of(configuration))
+            for configuration in self.configurations.values()
+        )
+
+    @property
+    def draws_claims(self) -> bool:
+        """Whether a PEM draws more than states: ghosts, classes, scores or track ids."""
+        return any(self.pems[str(unit.pem)].draws_claims for unit in self.modelled.values())
+
+    def _apart(self, unit: Unit) -> bool:
+        return unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
 
     def with_(self, experiment: Experiment) -> ExpandedExperiment:
         """The same units in an experiment that differs in its configurations, or in what is measured.

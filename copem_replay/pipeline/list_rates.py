@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from copem_replay.communication.arrivals import fusion_schedule
-from copem_replay.core.tracks import SAME_INSTANT_NS
+from copem_replay.core.tracks import SAME_INSTANT_NS, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.pipeline.receiver import listen, seen_by_all
+from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
@@ -17,10 +17,16 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
     """For each configuration how many intervals there are between fused lists issued while the log lasts, and the
     seconds they cover.
 
-    Units that only some runs have are taken to be there.
+    Units that only some runs have are taken to be there. Where units have outages it is all runs together.
     """
     world = replay.lists_only(experiment)
-    seen = seen_by_all(world, np.arange(1), states="true")
+    runs = experiment.runs if world.experiment.outages else 1
+    of_run = [_rates(world, seen_by_all(world, np.array([run]), states="true")) for run in range(runs)]
+    return {name: (sum(r[name][0] for r in of_run), sum(r[name][1] for r in of_run)) for name in of_run[0]}
+
+
+def _rates(world: WorldChunk, seen: Tracks) -> dict[str, tuple[int, float]]:
+    """Of one run."""
     rates = {}
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world.truth, world.experiment, name)

@@ -9,14 +9,16 @@ import numpy as np
 
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.drive import of_log, settings_notes
 from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.base import Ideal
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
+from copem_replay.perception.pem.ghosts import Beside
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.prepare import Replay
@@ -41,8 +43,10 @@ def notes_of(
     notes += settings_notes(experiment)
     notes += without_points(experiment)
     notes += _remembered_in_vain(experiment)
-    if experiment.measure.accuracy and not same_units(ready):
-        notes.append("no accuracy.parquet: units that only some runs have give each run its own instants")
+    if experiment.measure.accuracy and not same_instants(ready):
+        outages = any(replay.expanded.outages for replay in ready)
+        why = "outages" if outages else "units that only some runs have"
+        notes.append(f"no accuracy.parquet: {why} give each run its own instants")
     return notes
 
 
@@ -54,9 +58,9 @@ def _remembered_in_vain(experiment: Experiment) -> Iterator[str]:
             yield f"pems.{name}.memory.{quantity}: no couple has {what}, nothing to remember"
 
 
-def same_units(ready: Sequence[Replay]) -> bool:
-    """Whether all runs have the same units."""
-    return all(replay.expanded.same_in_all_runs for replay in ready)
+def same_instants(ready: Sequence[Replay]) -> bool:
+    """Whether all runs have the same units, and lists at the same instants."""
+    return all(replay.expanded.same_in_all_runs and not replay.expanded.outages for replay in ready)
 
 
 def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
@@ -74,12 +78,31 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})"
+    yield from _clocks(experiment)
+    yield from _beside_nobody(replay, experiment)
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
         late = [unit for unit in units if (configuration.latency_of(unit) or 0.0) > end_s]
         if late:
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
+
+
+def _clocks(experiment: Experiment) -> Iterator[str]:
+    """Which configurations know the true captures although a unit's clock is off."""
+    for name, configuration in experiment.configurations.items():
+        off = [unit for unit in experiment.units_of(configuration) if experiment.units[unit].clock is not None]
+        if off and isinstance(configuration.fusion, Ideal):
+            yield f"configuration {name}: ideal fusion goes by true captures and ignores the clock of {', '.join(off)}"
+
+
+def _beside_nobody(replay: Replay, experiment: Experiment) -> Iterator[str]:
+    """Ghosts beside objects that the log does not have."""
+    there = set(replay.scene.object_class.tolist())
+    for name, pem in experiment.pems.items():
+        for n, sort in enumerate(pem.ghosts):
+            if isinstance(sort.where, Beside) and not there & set(class_indices(sort.where.classes).tolist()):
+                yield f"pems.{name}.ghosts[{n}].where: beside: no {' or '.join(sort.where.classes)} in this log"
 
 
 def could_meet(replay: Replay) -> Bool:

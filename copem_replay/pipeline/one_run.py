@@ -54,7 +54,7 @@ class RunTracks:
         replay, runs = self.replay, np.array([self.run])
         [(_, presence)] = Presence.of(replay.expanded, replay.scene.log, runs).parts(runs)
         receivers = Receivers(runs, presence.sending)
-        for world in replay.worlds(self.experiment, presence.sending):
+        for world in replay.worlds(self.experiment, runs, presence.sending):
             around = replay.truth_cache_of(world.chunk)
             result = {}
             for name, one in receivers.receive(world):
@@ -63,6 +63,8 @@ class RunTracks:
                 else:
                     matches = match_lists(around, one, self.experiment.measure)
                     result[name] = as_fused_tracks(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
+                if one.faults is not None:
+                    result[name] = replace(result[name], faults=one.faults)
             yield result
 
 

@@ -26,6 +26,7 @@ from copem_replay.pipeline.chunking import Reach, time_chunks
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
 from copem_replay.pipeline.scoring import TruthCache
+from copem_replay.pipeline.stated_captures import stated_captures
 
 
 @dataclass(frozen=True)
@@ -121,12 +122,12 @@ class Replay:
     def world(self, experiment: Experiment) -> WorldChunk:
         """The log as the units of an experiment have it, by configuration."""
         units = self.expanded.with_(experiment)
-        return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units)
+        return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units, placed=self.placed)
 
     def worlds(
-        self, experiment: Experiment, sending: Bool | None, *, measured_only: bool = False
+        self, experiment: Experiment, runs: Int, sending: Bool | None, *, measured_only: bool = False
     ) -> Iterator[WorldChunk]:
-        """The same chunk by chunk, all of it or what is looked at.
+        """The same chunk by chunk, all of it or what is looked at, for runs (S,) that have the same lists.
 
         `sending (U,)`: the units whose lists the receivers hear, None: all.
         """
@@ -135,8 +136,12 @@ class Replay:
             yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment)
-        units, seen = lists.experiment, seen_by_all(lists, np.arange(1), states="true")
-        reach = Reach(units, {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations})
+        units, seen = lists.experiment, seen_by_all(lists, runs[:1], states="true")
+        heard = {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations}
+        stated = None
+        if units.runs_apart:
+            stated = {name: stated_captures(self.scene, of, units, int(runs[0])) for name, of in heard.items()}
+        reach = Reach(units, heard, stated)
         for chunk in self.chunks:
             earliest_s = reach.earliest_s(chunk)
             found = self.found(chunk, earliest_s).listable
@@ -147,6 +152,8 @@ class Replay:
                 None if self.recorded is None else self.recorded.captured_between(earliest_s, chunk.until_s),
                 units,
                 chunk,
+                self.placed,
+                earliest_s,
             )
 
     def lists_only(self, experiment: Experiment) -> WorldChunk:

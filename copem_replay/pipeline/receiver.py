@@ -11,22 +11,29 @@ import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.link import transmit
+from copem_replay.core.followed import followed_by
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import ObjectLists, TellsOf
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.time_chunk import WHOLE, TimeChunk
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
+from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse
 from copem_replay.fusion.inputs import Claims, inputs, lists_without_truth
+from copem_replay.perception.claims import claims_of
+from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.observation import Observations
-from copem_replay.perception.perceive import perceive
+from copem_replay.perception.outages import without_outages
+from copem_replay.perception.perceive import draws_of, perceive, with_states
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.stated_captures import StatedCaptures, stated_captures
 
 if TYPE_CHECKING:
     from copem_replay.io.recorded_units import RecordedUnits
+    from copem_replay.perception.sensor_poses import SensorPoses
 
 States = Literal["true", "expected", "sampled"]
 
@@ -36,7 +43,8 @@ class WorldChunk:
     """One log, or a time chunk of one, as the units of an experiment have it: what of it is the same in all runs.
 
     `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
-    unit per carrier. What was captured before the time chunk and is needed in it is there, too.
+    unit per carrier. What was captured before the time chunk and is needed in it is there, too, since `earliest_s`.
+    `placed`: where the units are, for what they list of nobody.
     """
 
     scene: Scene
@@ -45,6 +53,8 @@ class WorldChunk:
     recorded: RecordedUnits | None
     experiment: ExpandedExperiment
     chunk: TimeChunk = WHOLE
+    placed: SensorPoses | None = None
+    earliest_s: float = -np.inf
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,8 @@ class ReceiverOutput:
 
     `fused_tracks`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without
     truth ids, or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell;
-    `whole`: the instants are those of the whole log, not of a time chunk.
+    `whole`: the instants are those of the whole log, not of a time chunk. `stated`: what a fusion was told of captures,
+    in one run; None: the truth. `faults`: what of the lists is false or missing in it, where units have such.
     """
 
     heard: Tracks
@@ -63,22 +74,49 @@ class ReceiverOutput:
     fused: ObjectLists | None
     tells_of: TellsOf = "capture"
     whole: bool = True
+    stated: StatedCaptures | None = None
+    faults: UnitFaults | None = None
 
     @cached_property
     def lists(self) -> ObjectLists:
-        """The fused lists without truth ids."""
+        """The fused lists without truth ids; their entries go back to true captures."""
+        return self.told if self.stated is None else self.stated.true_lists(self.told, self.at.issue_s)
+
+    @cached_property
+    def told(self) -> ObjectLists:
+        """The same with the captures that their entries tell of."""
         if self.fused is not None:
             return self.fused
         assert self.fused_tracks is not None
         return as_lists(self.fused_tracks, self.scene)
 
+    @property
+    def captures_told_s(self) -> Float:
+        """(F,) the captures of the lists that were heard, as fusion was told of them."""
+        return self.heard.captured_s if self.stated is None else self.stated.stated_s
 
-def seen_by_all(world: WorldChunk, runs: Int, *, states: States, equipped: Bool | None = None) -> Tracks:
-    """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`."""
+
+def seen_by_all(
+    world: WorldChunk,
+    runs: Int,
+    *,
+    states: States,
+    equipped: Bool | None = None,
+    ghosts: GhostRows | None = None,
+) -> Tracks:
+    """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`.
+
+    Where units have outages, which lists there are differs from run to run: it is asked for one run at a time. So it is
+    with `ghosts`, rows without an object: they come after those of objects, and before what is recorded.
+    """
     experiment = world.experiment
     if equipped is not None:
         equipped = equipped[:, [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]]
     seen = perceive(world.scene, world.found, experiment, runs, states=states, equipped=equipped)
+    if ghosts is not None:
+        drawn = ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
+        seen = followed_by(seen, with_states(world.scene, ghosts.found.tracks, ghosts.found, experiment, drawn))
+    seen = without_outages(world.scene, seen, experiment, runs)
     if world.recorded is None:
         return seen
     recorded = world.recorded.tracks
@@ -135,9 +173,12 @@ class Receivers:
         seen: dict[States, Tracks] = {}  # each is made when first needed
         without_truth: list[ObjectLists] = []
 
+        ghosts = self._ghosts(world)
+
         def seen_in(states: States) -> Tracks:
             if states not in seen:
-                seen[states] = seen_by_all(world, self._runs, states=states)
+                false = ghosts if states == "sampled" else None
+                seen[states] = seen_by_all(world, self._runs, states=states, ghosts=false)
             return seen[states]
 
         for name, configuration in experiment.configurations.items():
@@ -148,25 +189,41 @@ class Receivers:
             heard = listen(seen_in(states), world.truth, experiment, name, self._there)
             if name not in self._schedules:
                 self._schedules[name] = fusion_schedule(heard, max_age_s=max_age_s)
+            faults = None if of_truth else _faults(world, seen_in(states), None if posterior else ghosts)
+            if isinstance(fusion, Ideal) and faults is not None:
+                faults = replace(faults, ghosts=faults.ghosts[:0])  # it knows them for what they are
             at = self._schedules[name].between(world.chunk.from_s, world.chunk.until_s)
             whole = world.chunk == WHOLE
             if isinstance(fusion, ListFusion):
                 if not without_truth:
-                    without_truth.append(_without_truth(world, seen_in("sampled"), self._runs))
-                told = inputs(heard, without_truth[0], max_age_s=max_age_s, at=at)
+                    without_truth.append(_without_truth(world, seen_in("sampled"), self._runs, ghosts))
+                stated, lists = None, without_truth[0]
+                if experiment.runs_apart:  # then the block has one
+                    stated = stated_captures(world.scene, heard, experiment, int(self._runs[0]))
+                if stated is not None:
+                    lists = stated.as_told(lists)
+                captured_s = None if stated is None else stated.stated_s
+                told = inputs(heard, lists, max_age_s=max_age_s, at=at, captured_s=captured_s)
                 where = f"configurations.{name}.fusion"
                 if fusion.resumable:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
                 else:  # such a log is one time chunk
                     fused = fused_by(fusion, told, where)
-                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole)
+                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole, stated, faults)
                 continue
             fused_tracks = fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
             if not of_truth and world.recorded is None:
                 fused_tracks = replace(fused_tracks, view=world.found.view)
             if posterior:
                 fused_tracks = draw_posterior(fused_tracks, world.scene, experiment.seed, self._runs)
-            yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole)
+            yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole, faults=faults)
+
+    def _ghosts(self, world: WorldChunk) -> GhostRows | None:
+        """What units list of nobody, where a block has one run and there is a fusion that would not know better."""
+        if not world.experiment.runs_apart or world.placed is None:
+            return None
+        between_s = world.earliest_s, world.chunk.until_s
+        return ghosts_in(world.scene, world.found, world.experiment, world.placed, int(self._runs[0]), between_s)
 
 
 def receive(world: WorldChunk, runs: Int, there: Bool | None) -> Iterator[tuple[str, ReceiverOutput]]:
@@ -174,13 +231,31 @@ def receive(world: WorldChunk, runs: Int, there: Bool | None) -> Iterator[tuple[
     return Receivers(runs, there).receive(world)
 
 
-def _without_truth(world: WorldChunk, seen: Tracks, runs: Int) -> ObjectLists:
+def _faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFaults | None:
+    """What of the lists of one run is false or missing; None: no unit has such."""
+    if ghosts is None and not world.experiment.outages:
+        return None
+    first = len(world.found.tracks.frame_ix)
+    rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
+    return UnitFaults(rows, np.isinf(seen.arrives_s[0]))
+
+
+def _without_truth(world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None) -> ObjectLists:
     """The units' lists as a real fusion sees them: no truth ids, and in no order that means anything."""
-    found, recorded = world.found, world.recorded
+    found, recorded, experiment = world.found, world.recorded, world.experiment
     words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]
     existence = found.existence
     likely = np.eye(len(CLASSES))[found.view.class_ix]
     track_id = np.full(len(words), -1)
+    if experiment.runs_apart and experiment.draws_claims:  # else nobody would hear of it
+        of = [claims_of(found, experiment, draws_of(world.scene, found, experiment, runs))]
+        if ghosts is not None:
+            drawn_of_ghosts = ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
+            of.append(claims_of(ghosts.found, experiment, drawn_of_ghosts, ghosts.sort))
+            words = np.concatenate([words, ghosts.words])
+        existence = np.concatenate([claims.existence for claims in of])
+        likely = np.concatenate([claims.class_probability for claims in of])
+        track_id = np.concatenate([claims.track_id for claims in of])
     if recorded is not None:
         words = np.concatenate([words, np.arange(len(recorded.existence), dtype=np.uint64)])
         existence = np.concatenate([existence, recorded.existence])

@@ -23,7 +23,7 @@ from copem_replay.pipeline.closed_form import check_exact, exact_table
 from copem_replay.pipeline.cost import Cost, watched
 from copem_replay.pipeline.list_rates import list_rates
 from copem_replay.pipeline.memory import memory_notes
-from copem_replay.pipeline.notes import notes_of, same_units
+from copem_replay.pipeline.notes import notes_of, same_instants
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.sweep import Point, points
 
@@ -89,7 +89,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):
-        accuracy = accuracy_tables(parts, order, same_units=same_units(ready))
+        accuracy = accuracy_tables(parts, order, same_instants=same_instants(ready))
     return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
 
 

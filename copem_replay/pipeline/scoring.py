@@ -92,7 +92,7 @@ class Scores:
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
     """Which true object each entry of the fused lists is about, at the instant it tells of."""
     world = around.at(output.at.issue_s if output.tells_of == "now" else _captures(output))
-    return match(output.lists, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
+    return match(output.told, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
 
 
 def _match_both(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
@@ -101,16 +101,16 @@ def _match_both(around: TruthCache, output: ReceiverOutput, measure: Measure) ->
         matches = match_lists(around, output, measure)
         return matches, matches
     then, now = around.at(_captures(output)), around.at(output.at.issue_s)
-    return match_both(output.lists, then, now, around.scene, gate_m=measure.match.gate_m)
+    return match_both(output.told, then, now, around.scene, gate_m=measure.match.gate_m)
 
 
 def _captures(output: ReceiverOutput) -> Float:
     """Captures, ascending: all that the entries name, at least; of a log in one piece all that were heard."""
-    captures: Float = np.unique(output.heard.captured_s)
+    captures: Float = np.unique(output.captures_told_s)
     if output.whole:
         return captures
     # Those next to what is named, before and after.
-    after = np.searchsorted(captures, output.lists.entries["captured_s"])
+    after = np.searchsorted(captures, output.told.entries["captured_s"])
     used = np.zeros(len(captures) + 1, dtype=bool)
     used[after] = used[np.maximum(after - 1, 0)] = True
     return captures[used[:-1]]

@@ -1,7 +1,8 @@
 """Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
 
 A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units
-themselves, one of `correlation_s` what their PEMs remember. Configurations that it leaves as they are, or makes equal
+themselves, one of `correlation_s` what their PEMs remember, one of `ghosts_in_list` what they list of nobody, of which
+the truth and ideal fusion never know. Configurations that it leaves as they are, or makes equal
 to one before, are left out. A latency is varied only where there is one (above 0, or by unit) or where the
 configuration is named: who hears of nobody over the air has none.
 """
@@ -13,12 +14,13 @@ from dataclasses import dataclass
 
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, SweptBy, Unit
+from copem_replay.fusion.base import ListFusion
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.pem.memory import Memory
 from copem_replay.perception.pem.model import Pem
 
-KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s")
+KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s", "ghosts_in_list")
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Point:
     @property
     def same_units(self) -> bool:
         """Whether what is prepared for the experiment serves this point, too."""
-        return self.sweep in ("latency_s", "units", "correlation_s")
+        return self.sweep in ("latency_s", "units", "correlation_s", "ghosts_in_list")
 
 
 def points(experiment: Experiment) -> Iterator[Point]:
@@ -130,6 +132,9 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
     if kind == "correlation_s":
         pems = [experiment.pems[unit.pem] for unit in units if unit.pem is not None]
         return any(pem.memory_of(c).get("detection") for pem in pems for c in range(len(pem.couples)))
+    if kind == "ghosts_in_list":
+        pems = [experiment.pems[unit.pem] for unit in units if unit.pem is not None]
+        return isinstance(configuration.fusion, ListFusion) and any(pem.ghosts for pem in pems)
     return kind != "penetration_rate" or any(isinstance(unit.on, Carriers) for unit in units)
 
 
@@ -170,6 +175,8 @@ def _units_at(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, U
 
 
 def _pems_at(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]:
+    if kind == "ghosts_in_list":
+        return {name: _with_ghosts(pem, value) for name, pem in pems.items()}
     if kind != "correlation_s":
         return dict(pems)
 
@@ -187,3 +194,11 @@ def _pems_at(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]
         )
         result[name] = pem.model_copy(update={"couples": couples, "memory": at(pem.memory)})
     return result
+
+
+def _with_ghosts(pem: Pem, in_list: float) -> Pem:
+    """A PEM with so many of the first of its sorts of ghosts."""
+    if not pem.ghosts:
+        return pem
+    first, *others = pem.ghosts
+    return pem.model_copy(update={"ghosts": (first.model_copy(update={"in_list": float(in_list)}), *others)})

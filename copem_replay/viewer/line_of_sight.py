@@ -111,7 +111,9 @@ def _hidden(
         return
     frames = part.start + within
     world = _world(replay, experiment, seen.elapsed_ns[frames])
-    then = UnitPoses(*(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present")))
+    then = UnitPoses(
+        *(getattr(at, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present", "ground_m"))
+    )
     watching = observers([then], np.array([carrier(replay.scene, unit)]))
     [hides] = hidden_by(world, replay.placed.static, watching, experiment.visibility)
     rows, column = _rows(world, seen.object_ix.tolist())

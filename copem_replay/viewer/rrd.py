@@ -35,6 +35,7 @@ from copem_replay.viewer.selection import SHOWN_OBJECTS, VIEWED, telling, viewed
 from copem_replay.viewer.sink import Out, digest, part_of
 from copem_replay.viewer.status import clock_of, status_of
 from copem_replay.viewer.stream import Live, file_stream
+from copem_replay.viewer.unit_faults import FaultsShown
 
 if TYPE_CHECKING:  # a second to import: only where something is written
     from rerun import blueprint as rrb
@@ -81,10 +82,12 @@ def write_rrd(
         if baseline is not None:  # of all objects at once: such a log is not long
             kept = {name: first[name] for name in colours}
             differences.differences(out, replay, experiment, kept, table[of_chosen], baseline, shown, colours)
+        faults = FaultsShown(out, replay, experiment)
         told, chunks = Kept(shown), chain(iter([first]), rest)
         del first  # one chunk's is held at a time
         for chunk in chunks:
             _believed(out, replay, experiment, chunk, table[of_chosen], shown, colours)
+            faults.add(chunk)
             told.add({name: chunk[name] for name in colours})
         _knowledge(out, replay, experiment, told.whole(), table[of_chosen], shown, colours)
     return list(_notes(path.name, left_out, out.live))

@@ -170,6 +170,57 @@ def test_whatever_is_replayed(plan: Experiment, rows: int) -> None:
     assert_same(whole, pieces)
 
 
+WRONG = {
+    "placed": {
+        "position_sigma_m": 0.3, "yaw_sigma_deg": 1.0, "stated": True,
+        "memory": [{"share": 0.2, "correlation_s": "always"}, {"share": 0.7, "correlation_s": 3.0}],
+    },
+    "clock": {"offset_sigma_s": 0.05, "drift_sigma_ppm": 5000.0},
+    "outages": {"down_share": 0.2, "lasts_s": 0.5},
+}  # fmt: skip
+ALL_WRONG = {
+    "couples": [NOISY[0] | {"existence": {"kind": "scores", "real": [8, 2], "ghost": [2, 4], "calibrated": True}}],
+    "memory": {
+        "detection": [{"share": 0.6, "correlation_s": 0.8}], "position": [{"share": 0.7, "correlation_s": 2.0}],
+        "class": [{"share": 0.5, "correlation_s": 1.0}], "existence": [{"share": 0.5, "correlation_s": 1.0}],
+    },
+    "ghosts": [
+        {"in_list": 0.4, "lasts_s": 0.7, "where": {"kind": "field", "range_m": [3, 40]}, "classes": {"car": 1.0}},
+        {"in_list": 0.2, "lasts_s": 2.0, "where": {"kind": "beside", "classes": ["truck", "car"], "within_m": 3}},
+        {"in_list": 0.3, "where": {"kind": "places", "at_m": [[12, 3]], "spread_m": 0.5}},
+    ],
+    "classes": {"confusion": {"pedestrian": {"pedestrian": 0.8, "bicycle": 0.2}}, "confidence": 0.8},
+    "tracks": {"lasts_s": 3.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", [60, 250])
+def test_all_that_units_get_wrong(rows: int) -> None:
+    units: dict[str, Any] = {
+        "ego": {"on": "ego", "height_m": 1.8, "pem": "noisy"} | WRONG,
+        "mast": {"at": [15.0, 8.0], "height_m": 5.0, "pem": "noisy", "rate_hz": 7.0, "phase_s": 0.03} | WRONG,
+    }
+    kinds: list[dict[str, Any]] = [
+        {"kind": "ideal"}, {"kind": "union"}, {"kind": "gnn"}, {"kind": "tracker", "late": "replay"},
+    ]  # fmt: skip
+    late = {"ego": 0.05, "mast": 0.37}
+    plan = experiment(
+        runs=2, pems={"noisy": ALL_WRONG}, units=units,
+        configurations={
+            "GT": {"units": "truth"},
+            **{kind["kind"]: {"units": "all", "fusion": kind, "latency_s": late} for kind in kinds},
+        },
+        measure={
+            "onset": {"kind": "in_range", "range_m": 40}, "confirm": {"hits": 2, "of": 3}, "match": {"always": True},
+        },
+    )  # fmt: skip
+    whole, pieces = both_ways(plan, [traffic()], rows)
+    assert len(pieces.replays[0].chunks) > 1
+    assert_same(whole, pieces)
+    parallel = run(plan, [traffic()], jobs=2)
+    assert_same(whole, parallel)
+
+
 def test_recorded_units(tmp_path: Path) -> None:
     """A unit whose lists come late, and once in the wrong order, beside fusions of all kinds."""
     lists = [
@@ -197,7 +248,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
     for replay in (whole.replays[0], pieces.replays[0]):
-        worlds = list(replay.worlds(plan, None, measured_only=True))
+        worlds = list(replay.worlds(plan, np.arange(1), None, measured_only=True))
         assert {int(k) for world in worlds for k in world.found.tracks.row_object_ix} == pedestrians
 
 
@@ -272,7 +323,7 @@ def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.Mo
     found = replay.found(WHOLE)
     listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
     assert 0 < len(listed) < len(found.view.range_m) / 2
-    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, None)]
+    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), None)]
     assert set().union(*held) == set(found.view.range_m[listed].tolist())
 
 

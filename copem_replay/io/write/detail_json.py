@@ -3,6 +3,8 @@
 One message per list on `copem/<configuration>/detail`: the full covariance and variances of each object, the entries of
 the units' lists it was made of (parallel lists of unit, capture, range, visible share), and what was detected with it.
 Of a fusion without truth ids: what it claims of the existence, and no entries. Objects are in the order of the list.
+Where units have ghosts or outages, `ghosts` are the entries about nobody in the lists that came in with this one, and
+`down` the units whose last list was not made.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 import orjson
 
 from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, Bool, Scene
+from copem_replay.io.write.fault_details import faults_by_list
 
 if TYPE_CHECKING:
     from copem_replay.core.fused_tracks import FusedTracks
@@ -79,6 +82,7 @@ class DetailWriter:
         }
         self._start = fused_tracks.used_start.tolist()
         self._said = fused_tracks.said
+        self._faults = faults_by_list(fused_tracks)
         self._sizes_of = np.zeros(len(fused.frame_ix), dtype=bool) if sizes_of is None else sizes_of
 
     def message(self, frame: int, available_ns: int) -> bytes:
@@ -89,6 +93,7 @@ class DetailWriter:
             "captured_ns": None if captured_ns == NO_CAPTURE_NS else captured_ns,
             "objects": [self._object(row) for row in self._listed(frame)],
             "events": list(self._events.get(frame, ())),
+            **(self._faults[frame] if self._faults else {}),
         }
         return orjson.dumps(content)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -13,18 +13,21 @@ from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.pem.detection import DETECTION_MODELS, DetectionModel
 from copem_replay.perception.pem.error import ERROR_MODELS, ErrorModel, names_asked
 from copem_replay.perception.pem.memory import QUANTITIES, Memory, check_names, quantity_of
+from copem_replay.perception.pem.scores import Claimed
 
 _ON_THE_BOUND = 1e-9
 """Bounds are included; a value this far outside is on the bound (metres, radians, shares)."""
 
 
-def _ascending(value: tuple[float, float]) -> tuple[float, float]:
+def ascending(value: tuple[float, float]) -> tuple[float, float]:
+    """Validate that a range ends where it begins, or later."""
     if value[1] < value[0]:
         raise ValueError(f"expected [from, to] with from ≤ to, found {list(value)}")
     return value
 
 
-def _one_turn(value: tuple[float, float]) -> tuple[float, float]:
+def one_turn(value: tuple[float, float]) -> tuple[float, float]:
+    """Validate that angles are within one turn."""
     beyond = [angle for angle in value if abs(angle) > 360]
     if beyond:
         raise ValueError(f"expected degrees from -360 to 360, found {beyond[0]:g} (through 0: [350, 10])")
@@ -45,10 +48,10 @@ ClassNames = Annotated[tuple[ClassName, ...], Field(min_length=1)]
 class Condition(Frozen):
     """When a couple applies. All that is given must hold; bounds are included."""
 
-    range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ascending)] | None = None
-    azimuth_deg: Annotated[tuple[Number, Number], AfterValidator(_one_turn)] | None = None
+    range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(ascending)] | None = None
+    azimuth_deg: Annotated[tuple[Number, Number], AfterValidator(one_turn)] | None = None
     classes: ClassNames | None = None
-    visible_share: Annotated[tuple[Share, Share], AfterValidator(_ascending)] | None = None
+    visible_share: Annotated[tuple[Share, Share], AfterValidator(ascending)] | None = None
 
     def holds(self, view: ViewGeometry) -> Bool:
         """(P,) where the condition holds."""
@@ -76,14 +79,14 @@ class Couple(Frozen):
     """(d_c, p_c) under condition c: the paper's element of a PEM. Without `error` the state is exact.
 
     `existence`: how probable the unit claims it to be that there is an object, of each entry alike (0.9 is chosen), or
-    by its visible share: the more of it is seen, the surer the unit. `memory`: which draws last where this couple
-    applies, in place of the PEM's.
+    by its visible share: the more of it is seen, the surer the unit; or drawn of each (`scores`). `memory`: which draws
+    last where this couple applies, in place of the PEM's.
     """
 
     when: Condition = Condition()
     detection: Annotated[DetectionModel, Slot("detection", DETECTION_MODELS)]
     error: Annotated[ErrorModel, Slot("error", ERROR_MODELS)] | None = None
-    existence: Share | Literal["visible_share"] = 0.9
+    existence: Claimed = 0.9
     memory: Memory | None = Field(default=None, exclude_if=lambda memory: memory is None)
 
     @model_validator(mode="after")

@@ -12,8 +12,12 @@ from pydantic import Field, GetJsonSchemaHandler, SerializerFunctionWrapHandler,
 from pydantic_core import CoreSchema
 
 from copem_replay.core.components import Frozen
+from copem_replay.perception.pem.classes import Classes
 from copem_replay.perception.pem.condition import Couple
+from copem_replay.perception.pem.ghosts import Ghosts
 from copem_replay.perception.pem.memory import QUANTITIES, Memory, Parts, check_names
+from copem_replay.perception.pem.scores import Scores
+from copem_replay.perception.pem.track_ids import TrackIds
 
 _OF_A_COUPLE = frozenset(Couple.model_fields) - {"memory"}
 
@@ -23,6 +27,9 @@ class Pem(Frozen):
 
     couples: Annotated[tuple[Couple, ...], Field(min_length=1)]
     memory: Memory = Field(default_factory=dict, exclude_if=lambda memory: not memory)
+    ghosts: tuple[Ghosts, ...] = Field(default=(), exclude_if=lambda ghosts: not ghosts)
+    classes: Classes | None = Field(default=None, exclude_if=lambda classes: classes is None)
+    tracks: TrackIds | None = Field(default=None, exclude_if=lambda tracks: tracks is None)
 
     @model_validator(mode="before")
     @classmethod
@@ -64,6 +71,21 @@ class Pem(Frozen):
         return self.memory if own is None else own
 
     @property
+    def draws_claims(self) -> bool:
+        """Whether what entries say beside their states, or which entries there are about nobody, is drawn."""
+        return self._scores or bool(self.ghosts) or self.classes is not None or self.tracks is not None
+
+    @property
+    def _scores(self) -> bool:
+        said = [*(couple.existence for couple in self.couples), *(sort.existence for sort in self.ghosts)]
+        return any(isinstance(one, Scores) for one in said)
+
+    @property
+    def ghosts_in_list(self) -> float:
+        """How many ghosts there are in a list on average; of those beside objects as if there were one object."""
+        return sum(sort.in_list for sort in self.ghosts)
+
+    @property
     def remembers(self) -> bool:
         """Whether anything lasts."""
         return any(self.memory_of(c) for c in range(len(self.couples)))
@@ -71,6 +93,9 @@ class Pem(Frozen):
     def in_vain(self) -> Iterator[str]:
         """Quantities that are remembered and that no couple draws."""
         asked = self.asked()
+        drawn = {"detection", *(asked or ())}
+        drawn |= {"class"} if self.classes is not None and self.classes.confusion else set()
+        drawn |= {"existence"} if self._scores else set()
         for name in self.memory if asked is not None else ():
-            if name not in ("detection", *(asked or ())):
+            if name not in drawn:
                 yield name

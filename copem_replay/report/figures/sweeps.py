@@ -33,6 +33,7 @@ AXES = {
     "units": "Number of units",
     "penetration_rate": "Share of vehicles that carry a unit",
     "correlation_s": "Correlation time of detection (s)",
+    "ghosts_in_list": "Ghosts in a list of a unit",
 }
 _ROWS = {
     "pass_share": "Share that passes",

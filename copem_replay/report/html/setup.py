@@ -11,6 +11,7 @@ from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.io.window import in_words
 from copem_replay.report.html.markup import Html, table, tag
 from copem_replay.report.html.tables import named
+from copem_replay.report.html.unit_errors import unit_errors
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import Study
@@ -69,7 +70,7 @@ def setting(study: Study) -> str:
     return (
         f"{counted(things, 'measured object')}, {counted(results.experiment.runs, 'run')}, so {counted(rows, 'row')} "
         f"for each configuration; common random numbers per run (seed {results.experiment.seed}). "
-        f"The clock of an object starts {_onset(results.experiment)}.{hits}"
+        f"The clock of an object starts {_onset(results.experiment)}.{hits}{unit_errors(results.experiment)}"
     )
 
 

@@ -1,0 +1,287 @@
+"""Ghosts in the lists of units: entries about nobody, which are born, last for a while and are gone.
+
+Births are Poisson points in time, so how many there are and how long they last does not depend on the list rate. What
+is drawn of one has an address of its own; it is listed like an object: with the error of the couple that applies where
+it is, and moved by the unit's pose error. A ghost stands: in the frame of the unit, in the world, or beside its object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from copem_replay.core.followed import followed_by
+from copem_replay.core.interpolation import wrap
+from copem_replay.core.lasting import ListTimes, births, shared
+from copem_replay.core.random import CounterRng, RandomKey, Words, object_words, stable_hash
+from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks, class_indices
+from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.perception.draws import Draws
+from copem_replay.perception.observation import Observations
+from copem_replay.perception.pem.classes import drawn_class, row_of
+from copem_replay.perception.pem.condition import applies
+from copem_replay.perception.pem.ghosts import Beside, Ghosts
+
+if TYPE_CHECKING:
+    from copem_replay.perception.config import PerceptionSetup
+    from copem_replay.perception.sensor_poses import SensorPoses, UnitPoses
+
+SIZES_M = {
+    "pedestrian": (0.6, 0.6, 1.7), "bicycle": (1.8, 0.6, 1.7), "motorcycle": (2.2, 0.8, 1.6), "car": (4.5, 1.9, 1.6),
+    "van": (5.2, 2.0, 2.1), "truck": (8.5, 2.5, 3.2), "bus": (12.0, 2.5, 3.2), "trailer": (7.0, 2.4, 2.8),
+    "animal": (0.8, 0.4, 0.7), "other": (1.0, 1.0, 1.0), "vehicle": (4.5, 1.9, 1.6),
+}  # fmt: skip
+"""Length, width and height of what is listed, by class (chosen)."""
+assert tuple(SIZES_M) == CLASSES
+
+
+@dataclass(frozen=True)
+class GhostRows:
+    """The ghosts in the lists of one run, row by row (P,): as observations of no object, which are all listed.
+
+    `words`: their addresses. `sort`: the place of each in its PEM's `ghosts`. `couple_ix`: whose error each has, the
+    one that applies where it is, else the first.
+    """
+
+    found: Observations
+    words: Words
+    sort: Int
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """The lists of one unit that are asked for, (L,): their numbers, stamps, and where the unit is at each."""
+
+    unit_ix: int
+    name: str
+    frame_ix: Int
+    stamp_ns: Int
+    poses: UnitPoses
+    at: Int  # (L,) places among the poses
+
+
+@dataclass(frozen=True)
+class _Born:
+    """Ghosts of one sort: their words (B,) and when each is drawn; their rows (R,), ghost by ghost in order of time.
+
+    `list_ix`: of the unit's lists that are asked for. `host`: the row of the object beside which the ghost is, or −1.
+    """
+
+    words: Words
+    drawn_ns: Int
+    ghost: Int
+    list_ix: Int
+    host: Int
+
+
+def ghosts_in(
+    scene: Scene,
+    found: Observations,
+    setup: PerceptionSetup,
+    placed: SensorPoses,
+    run: int,
+    between_s: tuple[float, float],
+) -> GhostRows | None:
+    """The ghosts in one run's lists that are captured from the first instant on and before the second.
+
+    `found`: what can be listed then, of all objects; its lists are those of the whole log. None: no PEM has any.
+    """
+    from_s, until_s = between_s
+    if not any(setup.pems[str(unit.pem)].ghosts for unit in setup.modelled.values()):
+        return None
+    rng, runs, pieces = CounterRng(setup.seed, scene.log), np.array([run]), [_none(found)]
+    for u, (name, unit) in enumerate(setup.modelled.items()):
+        frames = np.flatnonzero(found.tracks.frame_unit_ix == u)
+        poses = placed.poses[name]
+        captured_s = found.tracks.captured_s[frames]
+        asked = (captured_s >= from_s) & (captured_s < until_s)
+        stamps = found.tracks.stamp_ns[frames[asked]]
+        lists = _Lists(u, name, frames[asked], stamps, poses, np.flatnonzero(poses.present)[asked])
+        for n, sort in enumerate(setup.pems[str(unit.pem)].ghosts):
+            if sort.in_list > 0 and len(stamps):
+                born = _born(rng, scene, found, lists, (n, sort), runs)
+                if len(born.ghost):
+                    couples = setup.pems[str(unit.pem)].couples
+                    tracks, view = _states(rng, found.tracks, lists, (n, sort), runs, born)
+                    couple_ix = np.maximum(applies(couples, view), 0)
+                    sure = np.ones(len(couple_ix))
+                    rows = Observations(tracks, view, couple_ix, sure, sure)
+                    pieces.append(GhostRows(rows, born.words[born.ghost], np.full(len(sure), n)))
+    return _joined(pieces)
+
+
+def ghost_draws(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> Draws:
+    """The numbers of each ghost's rows."""
+    tracks = ghosts.found.tracks
+    random_key = RandomKey(tracks.units, tracks.row_unit_ix, ghosts.words, tracks.stamp_ns[tracks.frame_ix])
+    lists = ListTimes(tracks.stamp_ns, tracks.frame_unit_ix, tracks.frame_ix)
+    return Draws(CounterRng(setup.seed, scene.log), random_key, lists, np.array([run]))
+
+
+def _born(
+    rng: CounterRng, scene: Scene, found: Observations, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int
+) -> _Born:
+    """The ghosts of one sort that are in any of the lists."""
+    n, sort = numbered
+    hosts = _hosts(scene, found, lists, sort)
+    none = np.zeros(len(hosts.words), dtype=np.int64)
+    random_key = RandomKey((lists.name,), none, hosts.words, none)
+    salt = np.uint64(stable_hash("ghosts", n))
+    if sort.lasts_s == 0:
+        return _fresh(rng, hosts, lists, numbered, runs, salt)
+    stamps = lists.stamp_ns
+    alive = births(
+        rng, f"ghosts {n}", random_key, runs, every_s=sort.lasts_s / sort.in_list, lasts_s=sort.lasts_s,
+        from_ns=int(stamps[0]), until_ns=int(stamps[-1]) + 1,
+    )  # fmt: skip
+    first, after = np.searchsorted(stamps, alive.born_ns), np.searchsorted(stamps, alive.gone_ns)
+    ghost = np.repeat(np.arange(len(first)), after - first)
+    list_ix = np.arange(len(ghost)) - np.repeat(np.cumsum(after - first) - (after - first), after - first)
+    list_ix += first[ghost]
+    host = hosts.row[alive.row_ix[ghost], list_ix] if hosts.row is not None else np.full(len(ghost), -1)
+    there = host >= 0 if hosts.row is not None else np.ones(len(ghost), dtype=bool)
+    words = hosts.words[alive.row_ix] + alive.address_ns.astype(np.uint64) + salt
+    drawn_ns = np.zeros(len(first), dtype=np.int64)
+    return _Born(words, drawn_ns, ghost[there], list_ix[there], host[there])
+
+
+@dataclass(frozen=True)
+class _Hosts:
+    """Beside whom ghosts are, (H,) words, and the row of each in each list (H, L), −1: none; None: beside nobody."""
+
+    words: Words
+    row: Int | None
+
+
+def _hosts(scene: Scene, found: Observations, lists: _Lists, sort: Ghosts) -> _Hosts:
+    if not isinstance(sort.where, Beside):
+        nobody = np.zeros(1, dtype=np.int64)
+        everyone = shared(RandomKey((lists.name,), nobody, nobody.astype(np.uint64), nobody), "unit")
+        return _Hosts(everyone.object_word, None)
+    tracks = found.tracks
+    of_class = np.isin(found.view.class_ix, class_indices(sort.where.classes)) & (found.probability > 0)
+    rows = np.flatnonzero((tracks.row_unit_ix == lists.unit_ix) & of_class)
+    rows = rows[(tracks.frame_ix[rows] >= lists.frame_ix[0]) & (tracks.frame_ix[rows] <= lists.frame_ix[-1])]
+    objects, which = np.unique(tracks.row_object_ix[rows], return_inverse=True)
+    row = np.full((len(objects), len(lists.frame_ix)), -1)
+    row[which, tracks.frame_ix[rows] - lists.frame_ix[0]] = rows
+    return _Hosts(object_words(scene.object_ids)[objects], row)
+
+
+def _fresh(
+    rng: CounterRng, hosts: _Hosts, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int, salt: np.uint64
+) -> _Born:
+    """Others in every list: how many by one number of each list (of each host in it), drawn at its capture."""
+    from scipy.stats import poisson
+
+    n, sort = numbered
+    H, L = len(hosts.words), len(lists.stamp_ns)
+    host_ix, list_ix = np.divmod(np.arange(H * L), L)
+    if hosts.row is not None:
+        there = hosts.row.ravel() >= 0
+        host_ix, list_ix = host_ix[there], list_ix[there]
+    none = np.zeros(len(host_ix), dtype=np.int64)
+    random_key = RandomKey((lists.name,), none, hosts.words[host_ix], lists.stamp_ns[list_ix])
+    [uniform] = rng.uniform(f"ghosts {n}", random_key, runs)
+    count = poisson.ppf(uniform, sort.in_list).astype(np.int64)
+    which = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+    words = hosts.words[host_ix[which]] + number.astype(np.uint64) + salt
+    host = hosts.row[host_ix[which], list_ix[which]] if hosts.row is not None else np.full(len(which), -1)
+    return _Born(words, lists.stamp_ns[list_ix[which]], np.arange(len(which)), list_ix[which], host)
+
+
+def _states(
+    rng: CounterRng, true: Tracks, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int, born: _Born
+) -> tuple[Tracks, ViewGeometry]:
+    """Ghosts without any error, a track of each, and how they look from the unit: wholly visible."""
+    n, sort = numbered
+    none = np.zeros(len(born.words), dtype=np.int64)
+    random_key = RandomKey((lists.name,), none, born.words, born.drawn_ns)
+    place = np.stack([rng.uniform(f"ghosts {n} place {k}", random_key, runs)[0] for k in range(3)])
+    turn_rad = 2 * np.pi * rng.uniform(f"ghosts {n} turn", random_key, runs)[0]
+    shares = row_of(sort.classes)[None]
+    class_ix = drawn_class(shares, none, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
+    at, poses, host = lists.at[born.list_ix], lists.poses, born.host
+    x_m, y_m, heading_rad = poses.x_m[at], poses.y_m[at], poses.heading_rad[at]
+    ground_m, length_m, width_m = poses.ground_m[at], np.zeros(len(born.words)), np.zeros(len(born.words))
+    if sort.where.frame == "world":
+        x_m = y_m = heading_rad = np.zeros(len(at))
+    elif sort.where.frame == "object":
+        x_m, y_m, heading_rad = true.x_m[0, host], true.y_m[0, host], true.yaw_rad[0, host]
+        ground_m = true.z_m[0, host] - true.height_m[0, host] / 2
+        # An object is as large in all lists: any row of its ghost tells.
+        length_m[born.ghost], width_m[born.ghost] = true.length_m[0, host], true.width_m[0, host]
+    ahead_m, left_m = sort.where.places_m(place, length_m, width_m)[:, born.ghost]
+    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+    size_m = np.array(list(SIZES_M.values()))[class_ix]
+    values = {
+        "x_m": x_m + cos * ahead_m - sin * left_m,
+        "y_m": y_m + sin * ahead_m + cos * left_m,
+        "z_m": ground_m + size_m[:, 2] / 2,
+        "yaw_rad": wrap(heading_rad + turn_rad[born.ghost]),
+        "vx_mps": np.zeros(len(at)),
+        "vy_mps": np.zeros(len(at)),
+        "length_m": size_m[:, 0],
+        "width_m": size_m[:, 1],
+        "height_m": size_m[:, 2],
+    }
+    dx_m, dy_m = values["x_m"] - poses.x_m[at], values["y_m"] - poses.y_m[at]
+    bearing_rad = np.arctan2(dy_m, dx_m)
+    view = ViewGeometry(
+        range_m=np.hypot(dx_m, dy_m),
+        azimuth_rad=wrap(bearing_rad - poses.heading_rad[at]),
+        bearing_rad=bearing_rad,
+        visible_share=np.ones(len(at)),
+        class_ix=class_ix.astype(np.int8),
+        length_m=values["length_m"],
+        width_m=values["width_m"],
+        height_m=values["height_m"],
+        yaw_rad=values["yaw_rad"],
+        speed_mps=values["vx_mps"],
+    )
+    return _as_tracks(true, lists, born, values), view
+
+
+def _as_tracks(true: Tracks, lists: _Lists, born: _Born, values: dict[str, Float]) -> Tracks:
+    """One run's rows as tracks in the lists of `true`, one of each ghost."""
+    start = np.append(np.flatnonzero(np.diff(born.ghost, prepend=-1)), len(born.ghost))
+    return Tracks(
+        units=true.units,
+        start=start,
+        unit_ix=np.full(len(start) - 1, lists.unit_ix),
+        object_ix=np.full(len(start) - 1, -1),
+        frame_ix=lists.frame_ix[born.list_ix],
+        stamp_ns=true.stamp_ns,
+        captured_s=true.captured_s,
+        frame_unit_ix=true.frame_unit_ix,
+        arrives_s=true.arrives_s,
+        valid=np.ones((1, len(born.ghost)), dtype=bool),
+        **{name: column[None] for name, column in values.items()},
+    )
+
+
+def _none(found: Observations) -> GhostRows:
+    nobody = found.take_rows(np.empty(0, dtype=np.int64))
+    return GhostRows(nobody, np.empty(0, dtype=np.uint64), np.empty(0, dtype=np.int64))
+
+
+def _joined(pieces: Sequence[GhostRows]) -> GhostRows:
+    """Rows of several sorts and units one after the other."""
+    tracks = pieces[0].found.tracks
+    for piece in pieces[1:]:
+        tracks = followed_by(tracks, piece.found.tracks)
+
+    def rows(name: str) -> Float:
+        return np.concatenate([getattr(piece.found, name) for piece in pieces])
+
+    names = ViewGeometry.__dataclass_fields__
+    view = ViewGeometry(**{f: np.concatenate([getattr(piece.found.view, f) for piece in pieces]) for f in names})
+    couple_ix = np.concatenate([piece.found.couple_ix for piece in pieces])
+    found = Observations(tracks, view, couple_ix, rows("probability"), rows("existence"))
+    return GhostRows(
+        found, np.concatenate([piece.words for piece in pieces]), np.concatenate([piece.sort for piece in pieces])
+    )

@@ -1,0 +1,66 @@
+"""Existence scores: how sure a unit says it is of an entry, drawn anew of each, of real objects and of ghosts apart."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Discriminator, Field, Tag
+
+from copem_replay.core.components import Flag, Frozen, Share
+from copem_replay.core.tracks import Float
+
+_NODES = (1 - np.cos(np.linspace(0, np.pi, 1025))) / 2
+"""Where a Beta quantile is tabulated, linear between: denser at the ends, where it bends (chosen)."""
+_SUREST = 1e-6
+"""No score is nearer to 0 or 1 (chosen)."""
+
+Shape = Annotated[float, Field(strict=True, ge=0.1, le=1000)]
+
+
+class Scores(Frozen):
+    """Beta distributions of what is claimed of `real` objects and of a `ghost`: [a, b], mean a / (a + b).
+
+    `calibrated`: what is claimed is how probable it is that there is an object, given what was drawn, if beside the
+    ghosts of the PEM there is one real entry in a list; else it is what was drawn.
+    """
+
+    kind: Literal["scores"] = "scores"
+    real: tuple[Shape, Shape]
+    ghost: tuple[Shape, Shape]
+    calibrated: Flag = False
+
+    def claimed(self, uniform: Float, *, of_ghosts: bool, ghosts_in_list: float) -> Float:
+        """Existence as claimed, of uniforms in (0, 1) of any shape, all of real objects or all `of_ghosts`."""
+        drawn = np.interp(uniform, _NODES, _quantiles(*(self.ghost if of_ghosts else self.real)))
+        drawn = np.clip(drawn, _SUREST, 1 - _SUREST)
+        if not self.calibrated:
+            return drawn
+        if ghosts_in_list == 0:
+            return np.full_like(drawn, 1 - _SUREST)
+        from scipy.special import expit
+        from scipy.stats import beta
+
+        # One real entry to so many ghosts: the odds are 1 / ghosts_in_list before anything is drawn.
+        odds = beta.logpdf(drawn, *self.real) - beta.logpdf(drawn, *self.ghost) - np.log(ghosts_in_list)
+        claimed: Float = np.clip(expit(odds), _SUREST, 1 - _SUREST)
+        return claimed
+
+
+@lru_cache(64)
+def _quantiles(a: float, b: float) -> Float:
+    from scipy.stats import beta
+
+    table: Float = beta.ppf(_NODES, a, b)
+    return table
+
+
+def _how(value: Any) -> str:
+    return "scores" if isinstance(value, dict | Scores) else "number"
+
+
+Claimed = Annotated[
+    Annotated[Share | Literal["visible_share"], Tag("number")] | Annotated[Scores, Tag("scores")], Discriminator(_how)
+]
+"""How probable a unit says that it is that there is an object: of each entry alike, as much as is seen, or drawn."""

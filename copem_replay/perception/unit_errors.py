@@ -1,0 +1,64 @@
+"""What a unit gets wrong beside its PEM: its own pose, its clock, and that for a while it makes no lists. Keys.
+
+What comes of them: `pose_error.py`, `clock.py`, `outages.py`. docs/unit-errors.md.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, field_validator
+
+from copem_replay.core.components import Flag, Frozen, NotNegative
+from copem_replay.perception.pem.memory import Part, Parts
+
+
+class PoseError(Frozen):
+    """How far off a unit's idea of its own place and heading is: of mounting, and of localisation.
+
+    `position_sigma_m` in easting and in northing alike, `yaw_sigma_deg` of the heading. `memory`: the parts of it that
+    last, of the unit, or `of: all` units alike; the rest is new in every list. `stated`: the covariances that the unit
+    states tell of it.
+    """
+
+    position_sigma_m: NotNegative = 0.0
+    yaw_sigma_deg: NotNegative = 0.0
+    stated: Flag = False
+    memory: Parts | None = Field(default=None, exclude_if=lambda memory: memory is None)
+
+    @field_validator("memory")
+    @classmethod
+    def _of_units(cls, parts: tuple[Part, ...] | None) -> tuple[Part, ...] | None:
+        if any(part.of == "object" for part in parts or ()):
+            raise ValueError("of: object: a pose is of no object; expected unit or all")
+        return parts
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What lasts: of the unit where nothing else is said."""
+        return tuple(p.model_copy(update={"of": "unit"}) if p.of == "pair" else p for p in self.memory or ())
+
+
+class Clock(Frozen):
+    """What a unit's clock is off by: an offset, and a drift since the log's start. Standard deviations over the runs.
+
+    Within a run both are constant. A fusion is told of captures by this clock.
+    """
+
+    offset_sigma_s: NotNegative = 0.0
+    drift_sigma_ppm: NotNegative = 0.0
+
+
+class Outages(Frozen):
+    """A unit makes no list `down_share` of the time, for `lasts_s` on average: no list at all, not an empty one."""
+
+    down_share: Annotated[float, Field(strict=True, ge=0, le=0.999)]
+    lasts_s: Annotated[float, Field(strict=True, ge=0.001, le=86_400)]
+
+    @property
+    def correlation_s(self) -> float:
+        """Of the number that decides: down while it is below `down_share`, which ends at a renewal above.
+
+        Renewals come every `correlation_s` on average, and 1 − `down_share` of them are above: after `lasts_s`.
+        """
+        return self.lasts_s * (1 - self.down_share)
