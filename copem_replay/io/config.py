@@ -6,11 +6,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from copem_replay.core.components import Covariance, Frozen, Id, NotNegative, Number, Positive, Share
+from copem_replay.core.components import Covariance, Frozen, Id, Latency, NotNegative, Number, Positive, Share
 from copem_replay.io.schemas.object_lists import Fields
-
-Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
-"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 
 
 class Recorded(Frozen):
