@@ -1,6 +1,7 @@
 """What memory costs: numbers that last against new ones, and the crossing with and without it.
 
-Medians of nine calls each, one after the other in turn: whatever else the machine does is shared.
+Medians of nine calls each, in turn, in seconds of the processor: one thread works, and what else the machine does is
+not counted.
 """
 
 from __future__ import annotations
@@ -62,13 +63,13 @@ def remembering(experiment: Experiment) -> Experiment:
 
 
 def interleaved(calls: list[Callable[[], object]], times: int = 9) -> list[float]:
-    """Median seconds of each call, in turn, after one that compiles and warms up."""
+    """Median processor seconds of each call, in turn, after one that compiles and warms up."""
     for call in calls:
         call()
     took: list[list[float]] = [[] for _ in calls]
     for _ in range(times):
         for seconds, call in zip(took, calls, strict=True):
-            start = time.perf_counter()
+            start = time.process_time()
             call()
-            seconds.append(time.perf_counter() - start)
+            seconds.append(time.process_time() - start)
     return [median(seconds) for seconds in took]
