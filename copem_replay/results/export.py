@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from copem_replay.core.colours import configuration_colours
 from copem_replay.io.recording import Recording
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from copem_replay.experiment.schema import Configuration
     from copem_replay.pipeline.selected_runs import OneRun, ShownRun
 
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 class RunToExport:
     """One run of one log, in the configurations that are shown.
 
+    `one`: in the configurations that are shown. `every`: all of the experiment's, in its order: colours go by it.
     `table`: the rows of `detections.parquet` of this log and run. `summary`: of all logs and runs. `manifest`: what
     made the file.
     """
@@ -26,6 +29,7 @@ class RunToExport:
     recording: Recording
     shown: ShownRun
     one: OneRun
+    every: Mapping[str, Configuration]
     table: pd.DataFrame
     summary: pd.DataFrame
     manifest: dict[str, str]
@@ -35,11 +39,18 @@ class RunToExport:
 class Exporter:
     """A kind of file. `suffix`: with the dot. `write`: writes the file and returns notes for the user.
 
+    `names`: of the files that come of a stem and so many configurations, where they may be several.
+
     `write` raises OutputError where the file cannot be written, and RecordingError where the recording cannot be read.
     """
 
     suffix: str
     write: Callable[[Path, RunToExport], list[str]]
+    names: Callable[[str, int], list[str]] | None = None
+
+    def files(self, stem: str, configurations: int) -> list[str]:
+        """What the files are called, relative to what the stem is relative to."""
+        return [stem + self.suffix] if self.names is None else self.names(stem, configurations)
 
 
 def _write_mcap(path: Path, run: RunToExport) -> list[str]:
@@ -58,6 +69,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         family_of(recording),
         recording.window,
         truth_scene(run.one, run.table),
+        configuration_colours(run.every),
     )
 
 

@@ -93,7 +93,8 @@ def _files(
         files += [f"{name}.parquet" for name in _ACCURACY if getattr(result.accuracy, name) is not None] + ["bands.csv"]
     for log in shown_logs(experiment, result):
         for shown in shown_runs(experiment, result, log):
-            files += [_target(shown, log, recordings) + exporter.suffix for exporter in exporters]
+            stem, shown_count = _target(shown, log, recordings), len(experiment.shown())
+            files += [name for exporter in exporters for name in exporter.files(stem, shown_count)]
     return sorted(files)
 
 
@@ -157,6 +158,7 @@ def _run_to_export(
         recording,
         shown,
         one_run(recording, chosen, shown.run, next(r for r in result.replays if r.scene.log == log)),
+        experiment.configurations,
         result.table[of_run & result.table["configuration"].isin(names)],
         result.summary[result.summary["configuration"].isin(names)],
         manifest,

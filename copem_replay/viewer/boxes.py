@@ -7,45 +7,39 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from copem_replay.core.colours import Rgb
+from copem_replay.core.colours import TRUTH, Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
 from copem_replay.perception.visibility import Statics
+from copem_replay.viewer.palette import EGO, GRID, LANE, STANDING
 from copem_replay.viewer.sink import Out, f32, object_labels, slices, upright
 
 if TYPE_CHECKING:  # a second to import: only where something is written
     import rerun as rr
 
-EGO: Rgb = (250, 250, 250)
-"""The ego and all units."""
 SMALLEST_VARIANCE_M2 = 1e-6
 """Positions known better than this have no ellipse (chosen: 2 mm would not be seen)."""
 
 ALPHAS, STEP_S = (220, 160, 120, 90, 65, 45), 0.2
 """How opaque a box is, by its age in steps of so much, the last for all that is older (chosen)."""
 
+GRID_M, LONG_WAY_M = 10.0, 2000.0
+"""From line to line of the grid; where ways are longer than the second, ten times that (chosen)."""
 MOST_NAMES = 65_535
 """So many kinds of boxes the viewer can tell apart; objects past them share the last one's name."""
 
-LANE: Rgb = (95, 95, 105)
-"""Boundaries of lanes: seen, but behind all else."""
-_VRU, _VEHICLE, _OTHER = (235, 120, 140), (180, 180, 190), (150, 150, 130)
-
 
 def names_and_colours(scene: Scene) -> rr.AnnotationContext:
-    """A kind of box per object, by its index, and per class what nobody true belongs to: name, and colour in the log.
+    """A kind of box per object, by its index, and per class what belongs to no true object: name, colour in the log.
 
-    By class, darker where stationary. Written once, where a name in every box would be a sixth of the file.
+    The truth is grey, darker where stationary, the ego white. Written once, where a name in every box would be a sixth
+    of the file.
     """
     import rerun as rr
 
-    groups = {"vru": _VRU, "vehicles": _VEHICLE}
-    colour_of = {name: colour for group, colour in reversed(groups.items()) for name in CLASS_GROUPS[group]}
     infos = []
     for k, label in enumerate(object_labels(scene).to_pylist()[: MOST_NAMES - len(CLASSES)]):
-        red, green, blue = colour_of.get(CLASSES[scene.object_class[k]], _OTHER)
-        still = 1 if scene.moving[k] else 2
-        colour = EGO if k == scene.ego_ix else (red // still, green // still, blue // still)
+        colour = EGO if k == scene.ego_ix else TRUTH if scene.moving[k] else STANDING
         infos.append(rr.AnnotationInfo(k, label, colour))
     number = len(scene.object_ids)
     infos += [rr.AnnotationInfo(_kind(number + k), f"unmatched {name}") for k, name in enumerate(CLASSES)]
@@ -63,8 +57,21 @@ def truth(out: Out, scene: Scene, truth: Tracks, shown: Sequence[int]) -> None:
     path = ["world", "truth", "boxes"]
     _boxes(out, path, truth, lambda rows: {"class_ids": _kind(truth.row_object_ix[rows])})
     wireframe = rr.components.FillMode.MajorWireframe
-    out.static(path, rr.Boxes3D.from_fields(fill_mode=wireframe, radii=0.03, show_labels=False))
+    thin = rr.Radius.ui_points(0.6)
+    out.static(path, rr.Boxes3D.from_fields(fill_mode=wireframe, radii=thin, show_labels=False))
+    if scene.ego_ix >= 0:
+        _ego(out, scene, truth)
     out.static(["world", "truth", "paths"], _paths(truth, [*shown, scene.ego_ix]))
+
+
+def _ego(out: Out, scene: Scene, truth: Tracks) -> None:
+    """The ego's body: the one that is filled, so that it is found at once."""
+    import rerun as rr
+
+    path, whole = ["world", "truth", "ego"], truth.take_tracks(truth.object_ix == scene.ego_ix)
+    _boxes(out, path, whole, lambda rows: {})
+    solid = rr.components.FillMode.Solid
+    out.static(path, rr.Boxes3D.from_fields(colors=[(*EGO, 150)], fill_mode=solid, show_labels=False))
 
 
 def _paths(truth: Tracks, objects: Sequence[int]) -> rr.LineStrips3D:
@@ -75,7 +82,26 @@ def _paths(truth: Tracks, objects: Sequence[int]) -> rr.LineStrips3D:
     ground = f32(truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows] - truth.height_m[0, rows] / 2)
     broken = (np.diff(truth.track_ix[rows]) != 0) | (np.diff(truth.frame_ix[rows]) != 1)
     strips = np.split(ground, np.flatnonzero(broken) + 1) if len(rows) else []
-    return rr.LineStrips3D(strips, colors=[(*_OTHER, 90)], radii=0.03)
+    return rr.LineStrips3D(strips, colors=[TRUTH], radii=rr.Radius.ui_points(0.5))
+
+
+def grid(out: Out, truth: Tracks) -> None:
+    """Lines on the ground every 10 m around all ways; every 100 m where these are long."""
+    import rerun as rr
+
+    if not len(truth.frame_ix):
+        return
+    x, y = truth.x_m[0], truth.y_m[0]
+    step = GRID_M if max(np.ptp(x), np.ptp(y)) <= LONG_WAY_M else 10 * GRID_M
+    z = float(np.median(truth.z_m[0] - truth.height_m[0] / 2))
+    (west, east), (south, north) = (
+        ((np.floor(of.min() / step) - 2) * step, (np.ceil(of.max() / step) + 2) * step) for of in (x, y)
+    )
+    along = [[[at, south, z], [at, north, z]] for at in np.arange(west, east + step / 2, step)]
+    across = [[[west, at, z], [east, at, z]] for at in np.arange(south, north + step / 2, step)]
+    out.static(
+        ["world", "static", "grid"], rr.LineStrips3D(along + across, colors=[GRID], radii=rr.Radius.ui_points(0.5))
+    )
 
 
 def statics(out: Out, static: Statics) -> None:
@@ -103,7 +129,7 @@ def statics(out: Out, static: Statics) -> None:
         triangle_indices=np.concatenate([walls, lid]),
         albedo_factor=(110, 110, 110, 100),
     )
-    out.static(["world", "static"], mesh)
+    out.static(["world", "static", "obstacles"], mesh)
 
 
 def lane_boundaries(out: Out, lines: Sequence[Float]) -> None:
@@ -112,7 +138,7 @@ def lane_boundaries(out: Out, lines: Sequence[Float]) -> None:
 
     if len(lines):
         strips = [f32(*line.T) for line in lines]
-        out.static(["world", "truth", "lanes"], rr.LineStrips3D(strips, colors=[LANE], radii=0.05))
+        out.static(["world", "truth", "lanes"], rr.LineStrips3D(strips, colors=[LANE], radii=rr.Radius.ui_points(0.5)))
 
 
 def fused_boxes(out: Out, path: list[str], scene: Scene, fused_tracks: FusedTracks, colour: Rgb) -> None:
@@ -152,6 +178,7 @@ def _boxes(out: Out, path: list[str], tracks: Tracks, more: Callable[[Int], dict
             **more(rows),
         )
         out.columns(path, available_ns, columns.partition(counts))
+        out.flush()
 
 
 def _covariance(out: Out, path: list[str], tracks: Tracks, colour: Rgb) -> None:
@@ -174,5 +201,6 @@ def _covariance(out: Out, path: list[str], tracks: Tracks, colour: Rgb) -> None:
             quaternions=upright(np.arctan2(b, (a - d) / 2) / 2),
         )
         out.columns(path, available_ns, columns.partition(counts))
+        out.flush()
     solid = rr.components.FillMode.Solid
     out.static(path, rr.Ellipsoids3D.from_fields(colors=[(*colour, 55)], fill_mode=solid))

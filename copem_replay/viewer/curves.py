@@ -12,30 +12,36 @@ from copem_replay.core.interpolation import AROUND_S, at_instants, states_at
 from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import measured_objects
-from copem_replay.metrics.gospa import gospa
+from copem_replay.metrics.gospa import gospas_m
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.scoring import settings_of
 from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve
-from copem_replay.viewer.boxes import EGO
-from copem_replay.viewer.sink import Out, by_frame, elapsed_ns, part_of
+from copem_replay.viewer.palette import EGO
+from copem_replay.viewer.running import running
+from copem_replay.viewer.sink import Out, by_frame, elapsed_ns, entity_names, ns, part_of, plain
 
 LISTS_AT_ONCE = 2_000
 """For so many lists the truth is interpolated at a time (chosen)."""
 
-_LOOKS = {BY_EGO: (EGO, 3.0), BY_ANY: (TRUTH, 1.5)}
+_LOOKS = {BY_EGO: (EGO, 2.0), BY_ANY: (TRUTH, 1.0)}
 
 
 def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
-    """The curves of the object `name`."""
+    """The curves of one object; `name`: of it in entity paths."""
     import rerun as rr
 
     for whose, curve in curves.items():
         known = ~np.isnan(curve.share)
         # An empty row breaks the line. NaN would, too, but no two recordings with NaN compare equal.
         kept = known | np.append(False, known[:-1])
-        values = rr.Scalars.columns(scalars=curve.share[known]).partition(known[kept].astype(np.int64))
-        path = ["plots", "visible_share", name, whose]
-        out.columns(path, curve.elapsed_ns[kept], values)
+        value, instants = np.where(known, curve.share, -1.0)[kept], curve.elapsed_ns[kept]
+        # Between two that are the same the line is the same without what is there.
+        bends = np.append(True, value[1:] != value[:-1]) | np.append(value[:-1] != value[1:], True)[: len(value)]
+        bends = bends[: len(value)]
+        value, instants = value[bends], instants[bends]
+        values = rr.Scalars.columns(scalars=value[value >= 0]).partition((value >= 0).astype(np.int64))
+        path = ["plots", "visible_share", name, plain(whose)]
+        out.columns(path, instants, values)
         colour, width = _LOOKS[whose]
         out.static(path, rr.SeriesLines(names=whose, colors=colour, widths=width))
 
@@ -43,22 +49,34 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
 def position_errors(
     out: Out, replay: Replay, experiment: Experiment, name: str, fused: Tracks, shown: Sequence[int], colour: Rgb
 ) -> None:
-    """Distance from fused to true position of the shown objects, list by list."""
+    """Distance from fused to true position of the shown objects: running median, and its band."""
+    for k in shown:
+        elapsed, error_m = position_error(replay, experiment, k, fused)
+        banded(out, ["plots", "position_error", entity_names(replay.scene)[k], part_of(name)], elapsed, error_m, colour)
+
+
+def position_error(replay: Replay, experiment: Experiment, object_ix: int, fused: Tracks) -> tuple[Int, Float]:
+    """When lists hold an object while it is there, ascending, and the distance from its true position then."""
+    rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
+    time_s = fused.arrives_s[0, fused.frame_ix[rows]]
+    at, there = states_at(
+        replay.truth, fused.row_object_ix[rows], time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
+    )
+    error_m = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])[there]
+    # Of several entries that are matched with it in one list, which fusions by match do not give, the first.
+    times, first = np.unique(ns(time_s[there]), return_index=True)
+    return times, error_m[first]
+
+
+def banded(out: Out, path: list[str], elapsed_ns: Int, values: Float, colour: Rgb) -> None:
+    """A running median with its band; nothing where there is nothing."""
     import rerun as rr
 
-    # Points, as an error belongs to one list and to no time between two; no row where there is nothing to measure.
-    style = rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=2.5)
-    for k in shown:
-        rows = np.flatnonzero((fused.row_object_ix == k) & fused.valid[0])
-        frames = fused.frame_ix[rows]
-        at, there = states_at(
-            replay.truth, np.full(len(rows), k), fused.arrives_s[0, frames],
-            t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s,
-        )  # fmt: skip
-        error = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])[there]
-        path = ["plots", "position_error", replay.scene.object_ids[k], name]
-        out.columns(path, elapsed_ns(fused)[frames[there]], rr.Scalars.columns(scalars=error))
-        out.static(path, style)
+    of = running(elapsed_ns, values)
+    if len(of.elapsed_ns):
+        columns = rr.Measurements.columns(values=of.median, variances=of.half**2)
+        out.columns(path, of.elapsed_ns, columns)
+        out.static(path, rr.Measurements.from_fields(colors=[colour], widths=[1.5], names=[path[-1]]))
 
 
 def known(
@@ -79,7 +97,7 @@ def known(
     path = ["plots", "known", name if colour is None else part_of(name)]
     out.columns(path, elapsed_ns(tracks)[rows], rr.Scalars.columns(scalars=counts[rows].astype(float)))
     until_next = rr.components.InterpolationMode.StepAfter
-    colours, width = colour or TRUTH, 1.5 if colour else 4.0
+    colours, width = colour or TRUTH, 1.5 if colour else 1.0
     out.static(path, rr.SeriesLines(names=name, colors=colours, widths=width, interpolation_mode=until_next))
 
 
@@ -99,14 +117,16 @@ def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) 
     rows, listed = by_frame(fused, fused.valid[0] & (measured[fused.row_object_ix] | ghosts))
     elapsed, starts = elapsed_ns(fused), np.append(0, np.cumsum(listed))
     value_m = np.empty(len(listed))
+    at = np.stack([fused.x_m[0, rows], fused.y_m[0, rows]])
     for first in range(0, len(listed), LISTS_AT_ONCE):
         stamps = scene.t0_ns + elapsed[first : first + LISTS_AT_ONCE]
         world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
         order, bounds = world.by_frame
-        for f in range(len(stamps)):
-            there, said = order[bounds[f] : bounds[f + 1]], rows[starts[first + f] : starts[first + f + 1]]
-            both = (np.stack([t.x_m[0, r], t.y_m[0, r]], axis=-1) for t, r in ((world, there), (fused, said)))
-            value_m[first + f] = gospa(*both, cutoff_m=settings.cutoff_m, power=settings.power).value_m
+        there = np.stack([world.x_m[0, order], world.y_m[0, order]])
+        mine = slice(first, first + len(stamps))
+        value_m[mine] = gospas_m(
+            there, bounds, at, starts[first : first + len(stamps) + 1], settings.cutoff_m, settings.power
+        )
     return elapsed, value_m
 
 

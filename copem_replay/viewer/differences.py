@@ -20,16 +20,15 @@ import pyarrow.compute as pc
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import states_at
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.sink import Out, f32, ns, part_of
+from copem_replay.viewer.curves import banded, position_error
+from copem_replay.viewer.palette import DIFFERENCE
+from copem_replay.viewer.sink import Out, entity_names, f32, ns, part_of, table_rows
 
-GAINED: Rgb = (0, 158, 115)
-LOST: Rgb = (213, 94, 0)
-"""Bluish green and vermillion, told apart by colour-blind readers (Okabe & Ito 2008)."""
-_ABOVE_M, _MARK_POINTS = 4.5, 7
-"""How far marks are above a box, clear of its name, and how large they are (chosen)."""
+_ABOVE_M, _LOST_POINTS, _GAINED_POINTS = 3.5, 6.0, 3.0
+"""How far marks are above a box, clear of its name, and how large they are (chosen: what is missing matters)."""
 
 
 def differences(
@@ -45,7 +44,7 @@ def differences(
             _errors(out, replay, experiment, name, first, second, shown, colours[name])
             mine, other = (table[table["configuration"] == one] for one in (name, baseline))
             both = mine.merge(other, on="object_id", suffixes=("", "_baseline"))
-            _ways(out, replay, experiment, both, name, baseline, shown, colours[baseline])
+            _ways(out, replay, experiment, both, name, baseline, shown)
             _words(out, both, name, baseline)
 
 
@@ -60,9 +59,9 @@ def _who_knows(
     instants = np.unique(np.concatenate([ns(tracks.arrives_s[0]) for tracks in (replay.truth, first, second)]))
     mine, other = (_held(tracks, instants, len(scene.object_ids)) for tracks in (first, second))
     ids = pa.array(scene.object_ids, pa.string())
-    for part, only, colour, words in (
-        ("gained", mine & ~other, GAINED, f"not in {baseline}"),
-        ("lost", other & ~mine, LOST, f"only in {baseline}"),
+    for part, only, size, words in (
+        ("gained", mine & ~other, _GAINED_POINTS, f"not in {baseline}"),
+        ("lost", other & ~mine, _LOST_POINTS, f"only in {baseline}"),
     ):
         row, object_ix = np.nonzero(only)
         at, there = states_at(
@@ -75,9 +74,8 @@ def _who_knows(
         columns = rr.Points3D.columns(positions=place, labels=labels).partition(counts[kept])
         path = ["world", part_of(name), "difference", part]
         out.columns(path, instants[kept], columns)
-        out.static(
-            path, rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(_MARK_POINTS), show_labels=True)
-        )
+        dot = rr.Radius.ui_points(size)
+        out.static(path, rr.Points3D.from_fields(colors=[DIFFERENCE], radii=dot, show_labels=False))
 
 
 def _held(tracks: Tracks, instants: Int, objects: int) -> Bool:
@@ -94,37 +92,20 @@ def _errors(
     out: Out, replay: Replay, experiment: Experiment, name: str, first: Tracks, second: Tracks,
     shown: Sequence[int], colour: Rgb,
 ) -> None:  # fmt: skip
-    """How much farther off, positive, or nearer than the baseline each list has an object; points, as of one list."""
-    import rerun as rr
-
-    style = rr.SeriesPoints(names=name, colors=colour, markers="circle", marker_sizes=2.5)
+    """How much farther off, positive, or nearer than the baseline the lists of both have an object."""
     for k in shown:
-        (mine_ns, mine_m), (other_ns, other_m) = (_error(replay, experiment, k, one) for one in (first, second))
+        (mine_ns, mine_m), (other_ns, other_m) = (position_error(replay, experiment, k, one) for one in (first, second))
         near = np.searchsorted(other_ns, mine_ns - SAME_INSTANT_NS)
         both = near < len(other_ns)
         both[both] = other_ns[near[both]] <= mine_ns[both] + SAME_INSTANT_NS
         more_m = mine_m[both] - other_m[near[both]]
-        path = ["plots", "error_difference", replay.scene.object_ids[k], name]
-        out.columns(path, mine_ns[both], rr.Scalars.columns(scalars=more_m))
-        out.static(path, style)
-
-
-def _error(replay: Replay, experiment: Experiment, object_ix: int, fused: Tracks) -> tuple[Int, Float]:
-    """When lists hold an object while it is there, ascending, and the distance from its true position then."""
-    rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
-    time_s = fused.arrives_s[0, fused.frame_ix[rows]]
-    at, there = states_at(
-        replay.truth, fused.row_object_ix[rows], time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
-    )
-    error = np.hypot(fused.x_m[0, rows] - at["x_m"], fused.y_m[0, rows] - at["y_m"])[there]
-    # Of several entries that are matched with it in one list, which fusions by match do not give, the first.
-    times, first = np.unique(ns(time_s[there]), return_index=True)
-    return times, error[first]
+        path = ["plots", "error_difference", entity_names(replay.scene)[k], part_of(name)]
+        banded(out, path, mine_ns[both], more_m, colour)
 
 
 def _ways(
     out: Out, replay: Replay, experiment: Experiment, both: pd.DataFrame, name: str, baseline: str,
-    shown: Sequence[int], colour: Rgb,
+    shown: Sequence[int],
 ) -> None:  # fmt: skip
     """Where each shown object went between the two instants, from the later one on. `both`: rows of both, joined."""
     import rerun as rr
@@ -153,7 +134,9 @@ def _ways(
     path = ["world", part_of(name), "difference", "first"]
     strips = rr.LineStrips3D.columns(strips=lines[way], labels=pa.array(labels, pa.string()).take(pa.array(way)))
     out.columns(path, instants, strips.partition(counts))
-    out.static(path, rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(2.5), show_labels=True))
+    out.static(
+        path, rr.LineStrips3D.from_fields(colors=[DIFFERENCE], radii=rr.Radius.ui_points(2.5), show_labels=False)
+    )
 
 
 def _words(out: Out, both: pd.DataFrame, name: str, baseline: str) -> None:
@@ -171,7 +154,7 @@ def _together(both: pd.DataFrame) -> pd.Series:
 
 def _told(both: pd.DataFrame, name: str, baseline: str) -> Iterator[tuple[float, str, str]]:
     """When it is settled, how serious, what: a sentence for every object that at least one of the two knew."""
-    for episode in both.itertuples():
+    for episode in table_rows(both):
         who = f"{episode.object_id} {episode.object_class}"
         if episode.detected and episode.detected_baseline:
             after_s = episode.detection_s - episode.detection_s_baseline

@@ -18,13 +18,13 @@ from copem_replay.metrics.reference import Reference
 from copem_replay.perception.sensor_poses import carrier
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve
-from copem_replay.viewer.sink import Out, f32, ns, part_of, short_ids
+from copem_replay.viewer.palette import ONSET
+from copem_replay.viewer.sink import Out, entity_names, f32, ns, part_of, short_ids, table_rows
 from copem_replay.viewer.text_panels import verdict_of
 
-ONSET: Rgb = (255, 130, 220)
 MARK_SIZE = 6.5
-NAMED = 3
-"""With more marks than this they have no lines, and words only under the pointer (chosen: they lie on each other)."""
+LINED = 3
+"""With more marks than this they have no lines (chosen: they lie on each other)."""
 
 
 def onsets(out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, shown: Sequence[int]) -> None:
@@ -49,7 +49,7 @@ def detections(
 ) -> None:
     """Where the object truly was when the configuration `name` first knew it, and a line there from the ego.
 
-    “2 detected +0.90 s, 13.5 m, stops” is in its middle: its length is the distance at detection.
+    “2 detected +0.90 s, 13.5 m, stops” is told of its middle: its length is the distance at detection.
     """
     part = _of(replay, table, shown)
     part = part[(part["configuration"] == name) & part["detected"]]
@@ -59,7 +59,7 @@ def detections(
     part = part.iloc[order]
     told = [
         _told(episode, short_ids(replay.scene)[replay.scene.object_number[episode.object_id]])
-        for episode in part.itertuples()
+        for episode in table_rows(part)
     ]
     try:
         at = reference(part["detection_s"].to_numpy(dtype=float))
@@ -87,14 +87,13 @@ def _from_reference(
     counts = len(kept) - last
     _, mark = np.nonzero(np.arange(len(kept)) < counts[:, None])
     lines = np.stack(ends, axis=1)[mark]
-    named = len(kept) <= NAMED
-    if named:
+    if len(kept) <= LINED:
         out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=lines).partition(counts))
         out.static([*path, "line"], rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.0)))
     words = pa.array(texts, pa.string()).take(pa.array(kept[mark]))
     out.columns(path, instants, rr.Points3D.columns(positions=lines.mean(axis=1), labels=words).partition(counts))
     small = rr.Radius.ui_points(1)
-    out.static(path, rr.Points3D.from_fields(colors=[colour], radii=small, show_labels=named))
+    out.static(path, rr.Points3D.from_fields(colors=[colour], radii=small, show_labels=False))
 
 
 def _of(replay: Replay, table: pd.DataFrame, shown: Sequence[int]) -> pd.DataFrame:
@@ -147,6 +146,7 @@ def on_curves(
 
     if not curves:
         return
+    entity = entity_names(replay.scene)[replay.scene.object_number[name]]
     episodes = table[table["object_id"] == name]
     marks = [(BY_EGO, episodes["onset_s"].head(1), ONSET, rr.components.MarkerShape.Diamond)]
     for configuration, colour in colours.items():
@@ -171,7 +171,7 @@ def on_curves(
             markers=[shapes[m] for m in mine],
             marker_sizes=MARK_SIZE * 0.6 ** under[mine],
         )
-        path = ["plots", "visible_share", name, f"mark {k + 1}"]
+        path = ["plots", "visible_share", entity, f"mark_{k + 1}"]
         out.columns(path, instants[mine], [*rr.Scalars.columns(scalars=spots[mine]), *style])
 
 

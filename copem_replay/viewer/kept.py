@@ -32,7 +32,7 @@ class Kept:
     """Fused tracks of one run, of some objects only, taken in chunk by chunk, in order of time; values (1, P)."""
 
     def __init__(self, object_ix: Sequence[int]) -> None:
-        self._object_ix = np.array(object_ix, dtype=np.int64)
+        self.object_ix = np.array(object_ix, dtype=np.int64)
         self._pieces: dict[str, _Pieces] = {}
 
     def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
@@ -68,7 +68,7 @@ class Kept:
         pieces.keys.append(key[fresh])
 
     def _wanted(self, tracks: Tracks) -> Bool:
-        return np.asarray(np.isin(tracks.row_object_ix, self._object_ix))
+        return np.asarray(np.isin(tracks.row_object_ix, self.object_ix))
 
     @staticmethod
     def _key(tracks: Tracks) -> Int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -16,23 +17,29 @@ from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Experiment
+from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import share_curves
 from copem_replay.viewer import (
-    blueprint,
     boxes,
     curves,
     differences,
     event_markers,
+    lanes,
+    legend,
     sensors,
     status_drawing,
     text_panels,
 )
-from copem_replay.viewer.camera import eye_on, follow
+from copem_replay.viewer.axes import axis_s
+from copem_replay.viewer.blueprint import aspect, blueprint
+from copem_replay.viewer.camera import eye_above, eye_after, eye_on, follow
 from copem_replay.viewer.kept import Kept
-from copem_replay.viewer.line_of_sight import sight
-from copem_replay.viewer.selection import SHOWN_OBJECTS, VIEWED, telling, viewed
-from copem_replay.viewer.sink import Out, digest, part_of
+from copem_replay.viewer.line_of_sight import Sight, sight
+from copem_replay.viewer.pages import NEAR_BY, Content
+from copem_replay.viewer.selection import Part, in_parts, measured
+from copem_replay.viewer.sensors import named_units
+from copem_replay.viewer.sink import Out, digest, entity_names, part_of
 from copem_replay.viewer.status import clock_of, status_of
 from copem_replay.viewer.stream import Live, file_stream
 from copem_replay.viewer.unit_faults import FaultsShown
@@ -56,6 +63,9 @@ def write_rrd(
 ) -> list[str]:
     """Write one run of one log, and send it to a viewer, too. Returns notes for the user. Raises OutputError.
 
+    Of more than six configurations there are further files beside it, `replay.configurations_7-12.rrd`. Colours go by
+    the place among the experiment's configurations, whichever of them are written.
+
     `run_tracks`: one time chunk after the other, per configuration the receiver's fused tracks in this run, a frame per
     list it issued (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`:
     of all logs and runs. `run_is`: why it is this run, part of the recording's name. `baseline`: the configuration
@@ -63,34 +73,72 @@ def write_rrd(
     """
     rest = iter(run_tracks)
     first = next(rest)
-    chosen = viewed(experiment, list(first), baseline)
-    left_out = [name for name in first if name not in chosen]
-    of_chosen = table["configuration"].isin(chosen)
-    truths = [name for name in chosen if experiment.configurations[name].units == TRUTH]
-    shown = [replay.scene.object_number[name] for name in telling(table[of_chosen], truths, SHOWN_OBJECTS)]
-    eye = eye_on(replay, experiment, table, blueprint.aspect(len(chosen)))
-    panels, appearance = blueprint.blueprint(replay, experiment, table, chosen, shown, eye, baseline)
-    # The viewer takes two files of one identity for one recording.
-    ids = f"copem_replay:{appearance}", digest(experiment.model_dump_json(), replay.scene.log, str(run), run_is)
-    every = configuration_colours(first)  # as in the MCAP, which has all of them
-    colours = {name: every[name] for name in chosen}
-    with _streams(path, ids, replay.scene.t0_ns, viewer) as out:
-        _send_blueprint(out, panels)
-        follow(out, replay, experiment, eye)
-        _properties(out, replay, experiment, chosen, run, run_is)
-        _world(out, replay, experiment, table[of_chosen], summary, run, shown, left_out, colours)
+    parts = in_parts(list(first), baseline)
+    every = configuration_colours(experiment.configurations)  # by place, so the same in all files of the experiment
+    told = Kept(_measured(replay, experiment, table))
+    with ExitStack() as stack:
+        files = []
+        for part in parts:
+            content = _content(replay, experiment, table, part.configurations, told.object_ix.tolist(), baseline)
+            panels, appearance = blueprint(content)
+            what = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
+            # The viewer takes two files of one identity for one recording.
+            ids = f"copem_replay:{appearance}", digest(*what)
+            out = stack.enter_context(_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
+            files.append(_File(out, content, {name: every[name] for name in part.configurations}))
+            _begin(files[-1], panels, summary, run, run_is, [p.path(path).name for p in parts if p != part])
+        chunks = chain(iter([first]), rest)
         if baseline is not None:  # of all objects at once: such a log is not long
-            kept = {name: first[name] for name in colours}
-            differences.differences(out, replay, experiment, kept, table[of_chosen], baseline, shown, colours)
-        faults = FaultsShown(out, replay, experiment)
-        told, chunks = Kept(shown), chain(iter([first]), rest)
+            for file in files:
+                of = file.content
+                kept = {name: first[name] for name in file.colours}
+                differences.differences(file.out, replay, experiment, kept, table, baseline, of.objects, file.colours)
+        faults = [FaultsShown(file.out, replay, experiment) for file in files]
         del first  # one chunk's is held at a time
         for chunk in chunks:
-            _believed(out, replay, experiment, chunk, table[of_chosen], shown, colours)
-            faults.add(chunk)
-            told.add({name: chunk[name] for name in colours})
-        _knowledge(out, replay, experiment, told.whole(), table[of_chosen], shown, colours)
-    return list(_notes(path.name, left_out, out.live))
+            for file, shown in zip(files, faults, strict=True):
+                _believed(file, chunk)
+                shown.add(chunk)
+            told.add(chunk)
+        whole, found = told.whole(), replay.rows_of(told.object_ix)
+        seen = sight(replay, experiment, told.object_ix.tolist(), found)
+        for file in files:
+            _knowledge(file, whole, seen)
+            _shares(file, found)
+    return list(_notes(path, parts, [file.out.live for file in files]))
+
+
+@dataclass(frozen=True)
+class _File:
+    """One of the files: where it goes, what it shows, and the colours of its configurations, in order."""
+
+    out: Out
+    content: Content
+    colours: dict[str, Rgb]
+
+
+def _measured(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> list[int]:
+    """Indices of the objects that words, lanes and curves are about: the same in all files."""
+    truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
+    return [replay.scene.object_number[name] for name in measured(table, truths)]
+
+
+def _content(
+    replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int],
+    baseline: str | None,
+) -> Content:  # fmt: skip
+    wide = aspect(len(configurations))
+    eye = eye_on(replay, experiment, table, shown[0] if len(shown) else None, wide)
+    eyes = [eye_after(replay, experiment, table, k) for k in shown[:NEAR_BY]]
+    scene = replay.scene
+    episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in shown}
+    onset_s = float(episodes[shown[0]]["onset_s"].iloc[0]) if len(shown) else 0.0
+    axes_s = {k: axis_s(of_one, scene.end_s) for k, of_one in episodes.items()}
+    named = named_units(replay, experiment, eye.at_m, onset_s)
+    above = eye_above(np.stack([*named.values(), eye.at_m], axis=1), eye)
+    return Content(
+        replay, experiment, table, episodes, configurations, shown, axes_s, eye, eyes, above, list(named), baseline
+    )
 
 
 @contextmanager
@@ -111,80 +159,83 @@ def _streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | None) -
             live.close()
 
 
-def _send_blueprint(out: Out, panels: rrb.Blueprint) -> None:
-    """Active, so that neither the heuristics of a viewer apply nor, in a browser, a layout of its own."""
-    out.rec.send_blueprint(panels, make_active=True)
-    if out.live is not None:
-        out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
-
-
-def _notes(name: str, left_out: Sequence[str], live: Live | None) -> Iterator[str]:
-    if left_out:
-        yield f"{name}: without {', '.join(left_out)}; `show: {{configurations: […]}}` chooses up to {VIEWED}"
-    if live is not None and live.gone:
-        yield f"{name}: the viewer at {live.url} went before it had everything; the file is complete"
-
-
-def _world(
-    out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, summary: pd.DataFrame, run: int,
-    shown: Sequence[int], left_out: Sequence[str], colours: Mapping[str, Rgb],
-) -> None:  # fmt: skip
-    """What was there, and what came of it."""
+def _begin(
+    file: _File, panels: rrb.Blueprint, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]
+) -> None:
+    """The layout, made active so that no viewer puts its own guess in its place, and what holds for all of the log."""
     import rerun as rr
 
-    scene = replay.scene
+    out, of = file.out, file.content
+    replay, experiment, scene = of.replay, of.experiment, of.replay.scene
+    out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
+    for eye in (of.eye, *of.eyes):
+        follow(out, replay, eye)
+    _properties(out, replay, experiment, list(of.configurations), run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
-    text_panels.differences(out, replay, table, shown, left_out)
-    text_panels.summary(out, replay, experiment, summary, run, left_out)
+    mine = of.table[of.table["configuration"].isin(list(of.configurations))]
+    text_panels.differences(out, replay, mine, of.objects, further)
+    text_panels.summary(out, replay, experiment, summary, run, further)
     text_panels.legend(out)
-    text_panels.onsets(out, scene, table)
+    legend.bars(out, file.colours)
+    text_panels.onsets(out, scene, of.table)
+    boxes.grid(out, replay.truth)
     boxes.statics(out, replay.placed.static)
     boxes.lane_boundaries(out, replay.lane_boundaries)
     sensors.units(out, replay, experiment)
-    event_markers.onsets(out, replay, experiment, table, shown)
-    boxes.truth(out, scene, replay.truth, shown)
-    for name, colour in colours.items():
-        text_panels.events(out, scene, name, table[table["configuration"] == name])
-        event_markers.detections(out, replay, experiment, table, name, shown, colour)
-    rows = replay.rows_of(np.array(shown, dtype=np.int64))
-    for k in shown:
-        shares = share_curves(replay, rows, k)
-        curves.visible_share(out, scene.object_ids[k], shares)
-        event_markers.on_curves(out, replay, experiment, table, scene.object_ids[k], shares, colours)
+    event_markers.onsets(out, replay, experiment, of.table, of.objects)
+    boxes.truth(out, scene, replay.truth, of.objects)
+    for name, colour in file.colours.items():
+        text_panels.events(out, scene, name, of.table[of.table["configuration"] == name])
+        event_markers.detections(out, replay, experiment, of.table, name, of.objects, colour)
     if len(replay.episodes.object_ix):
         curves.known(out, replay, "truth", replay.truth)
 
 
-def _knowledge(
-    out: Out, replay: Replay, experiment: Experiment, run_tracks: Mapping[str, FusedTracks], table: pd.DataFrame,
-    shown: Sequence[int], colours: Mapping[str, Rgb],
-) -> None:  # fmt: skip
-    """Why, and since when. `run_tracks`: of the shown objects, over all of the log."""
-    seen = sight(replay, experiment, shown)
-    made = {}
-    for name, colour in colours.items():
-        clock = clock_of(replay.scene, table, name)
-        made[name] = status_of(replay, experiment, name, run_tracks[name], seen, clock)
+def _believed(file: _File, run_tracks: Mapping[str, FusedTracks]) -> None:
+    """What each configuration knew in a time chunk, of all objects."""
+    out, of = file.out, file.content
+    for name, colour in file.colours.items():
+        boxes.fused_boxes(out, ["world", part_of(name)], of.replay.scene, run_tracks[name], colour)
+        if len(of.replay.episodes.object_ix):
+            curves.gospas(out, of.replay, of.experiment, name, run_tracks[name], colour)
+            since_ns = clock_of(of.replay.scene, of.table, name).known_ns
+            curves.known(out, of.replay, name, run_tracks[name].fused, colour, since_ns)
+
+
+def _knowledge(file: _File, run_tracks: Mapping[str, FusedTracks], seen: Sight) -> None:
+    """Why, since when, and how far off. `run_tracks`: of the objects we look at, over all of the log."""
+    out, of = file.out, file.content
+    replay, experiment, scene = of.replay, of.experiment, of.replay.scene
+    made, clocks = {}, {}
+    for name, colour in file.colours.items():
+        fused_tracks, clock = run_tracks[name], clock_of(scene, of.table, name)
+        made[name], clocks[name] = status_of(replay, experiment, name, fused_tracks, seen, clock), clock
         status_drawing.words(out, name, replay, experiment, seen, made[name], clock)
         status_drawing.hiding(out, name, seen, made[name])
-        asked = experiment.configurations[name]
-        status_drawing.listings(out, name, replay, experiment, asked, run_tracks[name], seen, colour)
-    if shown:  # their onsets and ends are the same in all configurations
-        status_drawing.lanes(out, replay.scene, seen, made, colours, clock)
+        mine = of.table[(of.table["configuration"] == name) & of.table["detected"]]
+        first_unit = dict(zip(mine["object_id"].map(scene.object_number), mine["first_unit"], strict=True))
+        status_drawing.listings(out, name, replay, experiment, fused_tracks, seen, colour, first_unit)
+        curves.position_errors(out, replay, experiment, name, fused_tracks.fused, of.objects, colour)
+    lanes.lanes(out, scene, experiment, seen, made, file.colours, clocks, of.axes_s)
 
 
-def _believed(
-    out: Out, replay: Replay, experiment: Experiment, run_tracks: Mapping[str, FusedTracks], table: pd.DataFrame,
-    shown: Sequence[int], colours: Mapping[str, Rgb],
-) -> None:  # fmt: skip
-    """What each configuration knew in a time chunk, and how far off that was."""
-    for name, colour in colours.items():
-        boxes.fused_boxes(out, ["world", part_of(name)], replay.scene, run_tracks[name], colour)
-        curves.position_errors(out, replay, experiment, name, run_tracks[name].fused, shown, colour)
-        if len(replay.episodes.object_ix):
-            curves.gospas(out, replay, experiment, name, run_tracks[name], colour)
-            since_ns = clock_of(replay.scene, table, name).known_ns
-            curves.known(out, replay, name, run_tracks[name].fused, colour, since_ns)
+def _shares(file: _File, found: Observations) -> None:
+    """How much is seen of each object that we look at."""
+    out, of = file.out, file.content
+    names = entity_names(of.replay.scene)
+    for k in of.objects:
+        shares = share_curves(of.replay, found, k)
+        curves.visible_share(out, names[k], shares)
+        who = of.replay.scene.object_ids[k]
+        event_markers.on_curves(out, of.replay, of.experiment, of.table, who, shares, file.colours)
+
+
+def _notes(path: Path, parts: Sequence[Part], lives: Sequence[Live | None]) -> Iterator[str]:
+    for part in parts[1:]:
+        yield f"{path.name}: {', '.join(part.configurations)} in {part.path(path).name}"
+    gone = next((live for live in lives if live is not None and live.gone), None)
+    if gone is not None:
+        yield f"{path.name}: the viewer at {gone.url} went before it had everything; the file is complete"
 
 
 def _properties(

@@ -3,31 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import pandas as pd
-
-from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.receiver import by_truth
 
 SHOWN_OBJECTS = 6
 """Of how many measured objects words, lines, lanes and plots tell (chosen)."""
 VIEWED = 6
-"""How many configurations are shown: more views than this are too small to see anything (chosen)."""
+"""How many configurations a file has: more views than this are too small to see anything (chosen)."""
 
 
-def viewed(experiment: Experiment, configurations: Sequence[str], baseline: str | None = None) -> list[str]:
-    """Which configurations are shown, in their order: all, or the baselines (the truth, ideal fusion) before others.
+@dataclass(frozen=True)
+class Part:
+    """What one file holds of the configurations, and what its name has in addition."""
 
-    `baseline`: one that is shown in any case.
+    configurations: tuple[str, ...]
+    infix: str = ""
+
+    def path(self, path: Path) -> Path:
+        """The file's own path; `path`: of the first one."""
+        return path.with_name(f"{path.stem}{self.infix}{path.suffix}")
+
+
+def in_parts(configurations: Sequence[str], baseline: str | None = None) -> list[Part]:
+    """All configurations, in their order, six a file: `replay.rrd`, `replay.configurations_7-12.rrd` and so on.
+
+    A baseline that the others are held against is in every file; it is the first of them.
     """
-    if len(configurations) <= VIEWED:
-        return list(configurations)
-    baselines = [name for name in configurations if name == baseline or by_truth(experiment.configurations[name])]
-    baselines.sort(key=lambda name: name != baseline)
-    # Half of the views at most, so that there is something to compare with them.
-    others = [name for name in configurations if name not in baselines]
-    first = [*baselines[: max(VIEWED // 2, VIEWED - len(others))], *others][:VIEWED]
-    return [name for name in configurations if name in first]
+    shared = tuple(name for name in configurations if name == baseline)
+    others = [name for name in configurations if name != baseline]
+    each = VIEWED - len(shared)
+    parts = [Part((*shared, *others[:each]) if shared else tuple(others[:each]))]
+    for first in range(each, len(others), each):
+        mine = others[first : first + each]
+        begin = first + len(shared) + 1
+        last = f"-{begin + len(mine) - 1}" if len(mine) > 1 else ""
+        parts.append(Part((*shared, *mine), f".configurations_{begin}{last}"))
+    return parts
+
+
+def measured(table: pd.DataFrame, baselines: Sequence[str]) -> list[str]:
+    """Ids of the objects that words, lanes and curves are about: the one first that tells most."""
+    return sorted(telling(table, baselines, SHOWN_OBJECTS), key=telling(table, baselines, 1).__contains__, reverse=True)
 
 
 def telling(table: pd.DataFrame, baselines: Sequence[str], most: int) -> list[str]:

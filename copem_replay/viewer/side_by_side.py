@@ -16,6 +16,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.experiment.drive import of_log
+from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.pipeline.blocks import replay_block
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.selected_runs import STEM, OneRun, one_run
@@ -91,7 +92,7 @@ def write_beside(
     write_rrd(
         path,
         prepare(recording, experiment, onsets_of=of_log(sides[0].results.experiment, log)),
-        experiment,
+        experiment.model_copy(update={"configurations": _every(read, experiment)}),
         [{one.label: run_tracks[one.label] for one in wanted}],
         table.reset_index(drop=True),
         _summary(sides, wanted),
@@ -100,6 +101,20 @@ def write_beside(
         baseline=wanted[0].label,
     )
     return [f"{path}: {line}" for line in _one_world(sides)]
+
+
+def _every(read: Sequence[Results], experiment: Experiment) -> dict[str, Configuration]:
+    """All configurations of all folders, in their order, those that are shown as in `experiment`.
+
+    Colours go by their places: those of a folder's own files, as far as it is the first.
+    """
+    label_of = {(one.results, one.configuration): one.label for one in named(read)}
+    found: dict[str, Configuration] = {}
+    for results in read:
+        for name, asked in results.experiment.configurations.items():
+            label = label_of.get((results, name), f"{results.name}:{name}")
+            found[label] = experiment.configurations.get(label, asked)
+    return found
 
 
 def _which(first: Results, every: Sequence[Results], log: str | None, run: int | None) -> tuple[str, int]:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
@@ -23,7 +27,7 @@ SLICE_ROWS = 100_000
 LONG_ID = 12
 """Ids of more letters than this are shortened where they are drawn (chosen: a UUID has 36)."""
 
-_RESERVED = ("truth", "static", "units", "fields", "eye")
+_RESERVED = ("truth", "static", "units", "fields", "eyes", "names")
 
 
 @dataclass(frozen=True)
@@ -35,11 +39,14 @@ class Out:
     live: Live | None = None
 
     def send(self, what: Callable[[rr.RecordingStream], None]) -> None:
-        """To the file, and to the viewer if there is one; returns when it has left this program."""
+        """To the file, and to the viewer if there is one."""
         what(self.rec)
-        self.rec.flush()
         if self.live is not None:
             self.live.send(what)
+
+    def flush(self) -> None:
+        """Returns when all that was sent has left this program: so that little of it is held at a time."""
+        self.rec.flush()
 
     def static(self, path: Sequence[str], *what: Any) -> None:
         """What holds at all times."""
@@ -70,6 +77,35 @@ def path_of(*parts: str) -> str:
     import rerun as rr
 
     return rr.new_entity_path(list(parts))
+
+
+def plain(name: str) -> str:
+    """A name as a part of an entity path that needs no escapes: “coPEM_0.5s”."""
+    return re.sub(r"[^0-9A-Za-z_.-]+", "_", name)
+
+
+def entity_names(scene: Scene) -> list[str]:
+    """(N,) what objects are called in entity paths, “6_pedestrian”; a number after those that would be the same."""
+    names = [f"{plain(name)}_{CLASSES[k]}" for name, k in zip(short_ids(scene), scene.object_class, strict=True)]
+    twice = {name for name, count in Counter(names).items() if count > 1}
+    return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
+
+
+def lanes_of(scene: Scene, object_ix: int) -> list[str]:
+    """The entity that has all lanes of an object."""
+    return ["lanes", entity_names(scene)[object_ix]]
+
+
+def lane_path(scene: Scene, object_ix: int, place: int, configuration: str) -> list[str]:
+    """The entity of one lane; `place`: of the configuration among those of the file, from 0."""
+    return [*lanes_of(scene, object_ix), f"{place + 1}_{plain(configuration)}"]
+
+
+def table_rows(table: pd.DataFrame) -> list[SimpleNamespace]:
+    """The rows of a table, with its columns by name; `itertuples` makes a class for every table, which takes longer."""
+    names = list(table.columns)
+    columns = [table[name].tolist() for name in names]
+    return [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in zip(*columns, strict=True)]
 
 
 def digest(*texts: str) -> str:

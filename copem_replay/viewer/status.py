@@ -34,14 +34,21 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.line_of_sight import CLEAR_ABOVE, Sight
 from copem_replay.viewer.sink import elapsed_ns, ns
+from copem_replay.viewer.statuses import (
+    ABSENT,
+    CAPTURED,
+    EARLY,
+    HIDDEN,
+    KNOWN,
+    LOST,
+    OUT,
+    TOO_LATE,
+    UNCONFIRMED,
+    UNLISTED,
+    UNMATCHED,
+    VISIBLE,
+)
 
-STATUSES = (
-    "absent", "not listed", "out of view", "hidden", "visible", "lost", "captured", "unmatched",
-    "listed before the onset", "listed, not confirmed", "listed too late", "known",
-)  # fmt: skip
-(
-    ABSENT, UNLISTED, OUT, HIDDEN, VISIBLE, LOST, CAPTURED, UNMATCHED, EARLY, UNCONFIRMED, TOO_LATE, KNOWN,
-) = range(len(STATUSES))  # fmt: skip
 NEVER_NS = np.iinfo(np.int64).max
 
 

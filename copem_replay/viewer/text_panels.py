@@ -12,7 +12,7 @@ from copem_replay.core.tracks import Scene
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.end_reason import EndReason
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.sink import Out, ns, part_of, short_ids
+from copem_replay.viewer.sink import Out, ns, part_of, short_ids, table_rows
 
 
 def onsets(out: Out, scene: Scene, table: pd.DataFrame) -> None:
@@ -22,7 +22,7 @@ def onsets(out: Out, scene: Scene, table: pd.DataFrame) -> None:
     episodes = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
     text = [
         f"onset of {_who(episode, scene)}" + (", already at its first frame" if episode.onset_at_start else "")
-        for episode in episodes.itertuples()
+        for episode in table_rows(episodes)
     ]
     out.columns(
         ["events", "onsets"], ns(episodes["onset_s"]), rr.TextLog.columns(text=text, level=["INFO"] * len(text))
@@ -33,7 +33,7 @@ def events(out: Out, scene: Scene, name: str, part: pd.DataFrame) -> None:
     """How each episode ended. `part`: the rows of one configuration."""
     import rerun as rr
 
-    told = sorted((_ending(episode, scene) for episode in part.itertuples()), key=lambda event: event[0])
+    told = sorted((_ending(episode, scene) for episode in table_rows(part)), key=lambda event: event[0])
     text = [f"{name}: {sentence}" for _, _, sentence in told]
     columns = rr.TextLog.columns(text=text, level=[level for _, level, _ in told])
     out.columns(["events", part_of(name)], ns([time_s for time_s, _, _ in told]), columns)
@@ -82,11 +82,11 @@ def differences(out: Out, replay: Replay, table: pd.DataFrame, shown: Sequence[i
 
 
 def _difference(episodes: pd.DataFrame, scene: Scene) -> str:
-    first = next(episodes.itertuples())
+    first = table_rows(episodes)[0]
     braking = bool(getattr(first, "conflict", False))
-    head = ["configuration", "known after", "at distance", *(["verdict", "smallest distance"] if braking else []), "by"]
+    head = ["configuration", "known after", "at", *(["verdict", "closest"] if braking else []), "by"]
     lines = [f"| {' | '.join(head)} |", "| --- |" + " ---: |" * (len(head) - 1)]
-    for episode in episodes.itertuples():
+    for episode in table_rows(episodes):
         cells = [
             f"{episode.time_to_detection_s:.2f} s" if episode.detected else "never",
             _metres(episode.distance_at_detection_m),
@@ -102,24 +102,24 @@ def _difference(episodes: pd.DataFrame, scene: Scene) -> str:
 
 
 def _overview(of_each: Sequence[pd.DataFrame], scene: Scene) -> str:
-    """A row per object, a column per configuration: known after, at a distance, and the verdict."""
-    names = list(of_each[0]["configuration"])
-    lines = [f"| known after | {' | '.join(map(_cell, names))} |", "| --- |" + " ---: |" * len(names)]
-    for episodes in of_each:
+    """A row per configuration, a column per object: known how long after its onset, and a verdict that is a failure."""
+    ids = [short_ids(scene)[scene.object_number[episodes["object_id"].iloc[0]]] for episodes in of_each]
+    lines = [f"| known after onset of | {' | '.join(map(_cell, ids))} |", "| --- |" + " ---: |" * len(ids)]
+    of = [{episode.configuration: episode for episode in table_rows(episodes)} for episodes in of_each]
+    for name in of_each[0]["configuration"]:
         cells = []
-        for episode in episodes.itertuples():
-            after = f"{episode.time_to_detection_s:.2f} s, {_metres(episode.distance_at_detection_m)}"
-            verdict = {None: "", "stays clear": ", pass"}.get(verdict_of(episode), ", **fail**")
-            cells.append((after if episode.detected else "never") + verdict)
-        lines.append(f"| {_who(next(episodes.itertuples()), scene)} | {' | '.join(cells)} |")
+        for episodes in of:
+            after = f"{episodes[name].time_to_detection_s:.2f} s" if episodes[name].detected else "never"
+            cells.append(after + {None: "", "stays clear": ""}.get(verdict_of(episodes[name]), " **fail**"))
+        lines.append(f"| {_cell(name)} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def legend(out: Out) -> None:
-    """What colours and lines mean."""
+    """What colours and lines mean, in words."""
     import rerun as rr
 
-    out.static(["legend"], rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN))
+    out.static(["words"], rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN))
 
 
 def _cell(text: object) -> str:
@@ -133,21 +133,23 @@ def _metres(value: Any) -> str:
 def _left_out(names: Sequence[str]) -> list[str]:
     if not names:
         return []
-    return [f"Not in this file: {', '.join(names)}. `show: {{configurations: […]}}` chooses others."]
+    return [f"In further files: {', '.join(names)}."]
 
 
-LEGEND = """A configuration has one colour everywhere.
+LEGEND = """A configuration has one colour in every file and figure of its experiment.
 
-- outlines: what was there (white vehicles, pink pedestrians and two-wheelers, darker where stationary), and the ways of
-  those we look at; grey bodies: obstacles
-- filled: fused tracks at their fused position, paler the older it is (0 to 1 s); ellipses: 2σ of the position
-- white points: units, with the outlines of their fields of view; thin lines: from each, where it was at capture, to
-  where it listed somebody
-- red lines: from the unit that sees most of somebody to what hides them
-- strong lines on the ground: distance when somebody was first known
-- lanes: dark grey out of view, red hidden, grey seen but not listed, bluish grey listed and not arrived; colour known,
-  at half its strength in the newest list and not known yet: captured before the onset, not confirmed, or too late;
-  pink, a lane for all: since the onset"""
+- grey outlines: what was there, and the ways of those we look at; the white body: the ego; grey bodies: obstacles
+- filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); ellipses: 2σ of the
+  position
+- words over an object we look at: only its name, it is known; else why it is not: `58 behind 41`; a
+  sentence, when it is selected
+- red lines: from the unit that sees most of an object to what hides it
+- lines of sight: from the unit that listed an object first, where it was at capture, to where it listed the object
+- strong lines on the ground: distance when an object was first known
+- white points: units; pale ground with an outline: their fields of view
+- lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed*, which does
+  not count: before the onset, not confirmed, or too late; grey and brown: why not; the white mark ends at the onset
+- compared with a baseline: a large white dot, only the baseline holds it; a small one, the baseline does not"""
 
 
 def summary(

@@ -6,6 +6,7 @@ What counts is what `detections.parquet` says; lanes, words, curves and the arra
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,12 @@ from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.line_of_sight import sight
 from copem_replay.viewer.selection import SHOWN_OBJECTS, telling
-from copem_replay.viewer.status import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED, clock_of, status_of
+from copem_replay.viewer.status import clock_of, status_of
+from copem_replay.viewer.statuses import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED
 from tests.helpers.recordings import SHARED
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
-from tests.viewer.test_rrd import SUMMARY, at, rows
-from tests.viewer.test_status import PERSON, lane, told
+from tests.viewer.test_rrd import SUMMARY, rows
+from tests.viewer.test_status import PERSON, labels, lane, told
 
 RUNS = 6
 NOISY = {"kind": "gaussian", "covariance_m2": [[0.2, 0.0], [0.0, 0.2]]}
@@ -151,7 +153,7 @@ def test_so_it_is_on_a_drive(measure: str) -> None:
 
 @pytest.mark.parametrize("measure", ["plain", "3 of 5, earlier"])
 def test_so_do_all_views(measure: str, tmp_path: Path) -> None:
-    """Lanes, words and the curve of how many are known, as they are in the file."""
+    """Lanes, labels, sentences, marks and the curve of how many are known, as they are in the file."""
     wanted = plan(**MEASURES[measure])
     replay = prepare(waiting(), wanted)
     table, shown = shown_in(replay, wanted, 2)
@@ -164,30 +166,35 @@ def test_so_do_all_views(measure: str, tmp_path: Path) -> None:
         mine = table[table["configuration"] == name].set_index("object_id")
         for k in shown:
             who = replay.scene.object_ids[k]
-            known = [time_s for time_s, said in lane(path, f"{who} pedestrian", c) if said == f"{name} known"]
+            known = [time_s for time_s, said in lane(path, f"{who} pedestrian", c) if said == "known"]
             detection_s = mine.loc[who, "detection_s"]
             assert known[:1] == ([] if np.isnan(detection_s) else [pytest.approx(detection_s, abs=1e-9)])
             said = [
                 (row["elapsed"] / 1e9, label)
                 for row in rows(path, f"/world/{name}/status")
-                for label in row["Points3D:labels"]
-                if label.startswith(f"{who} known")
+                for label in [*row.get("Points3D:labels", []), *row.get("why:why", [])]
+                if label == who or label.startswith(f"{who} known")  # what is known is only named
             ]
             assert all(time_s >= detection_s - 1e-9 for time_s, _ in said)
             assert bool(said) == bool(known)
+            marked = [
+                row["elapsed"] / 1e9
+                for row in rows(path, f"/world/{name}/marks/from")
+                if any(text.startswith(f"{who} ") for text in row["Points3D:labels"])
+            ]
+            assert all(time_s >= detection_s - 1e-9 for time_s in marked)
         counted = [(row["elapsed"] / 1e9, row["Scalars:scalars"][0]) for row in rows(path, f"/plots/known/{name}")]
         assert counted
         for time_s, count in counted:
             assert count <= (mine["detection_s"] <= time_s + 1e-9).sum()
-    # A lane of its own says when the clock runs: from the onset to the end of the look.
+    # The mark in every lane ends at the onset.
     for k in shown:
         who = replay.scene.object_ids[k]
-        [episode] = table[(table["configuration"] == "GT") & (table["object_id"] == who)].itertuples()
-        clock = lane(path, f"{who} pedestrian", len(six))
-        assert clock[-2:] == [
-            (pytest.approx(episode.onset_s, abs=1e-9), "since the onset"),
-            (pytest.approx(episode.ended_s, abs=2e-9), "no longer looked at"),
-        ]
+        onset_s = table[table["object_id"] == who]["onset_s"].iloc[0]
+        for c in range(len(six)):
+            told_at = lane(path, f"{who} pedestrian", c)
+            ends = [b[0] for a, b in pairwise(told_at) if a[1] == "onset"]
+            assert ends == ([pytest.approx(onset_s, abs=1e-9)] if onset_s > 0.1 else [])
 
 
 def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None:
@@ -200,20 +207,28 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
     table = replay_block(replay, wanted, np.array([0]))
     path = tmp_path / "x.rrd"
     write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
-    assert lane(path, "2 pedestrian", 0)[:2] == [(0, "GT listed before the onset"), (1, "GT known")]
-    assert lane(path, "2 pedestrian", 1) == [
-        (0, "late captured"),
-        (0.5, "late listed before the onset"),
-        (1.5, "late known"),
+    assert lane(path, "2 pedestrian", 0)[:3] == [
+        (0, "listed, captured before the onset"),
+        (pytest.approx(1.0, abs=0.04), "onset"),
+        (1, "known"),
     ]
-    assert lane(path, "2 pedestrian", 2)[:2] == [(0, "before the onset"), (1, "since the onset")]
+    assert lane(path, "2 pedestrian", 1) == [
+        (0, "on its way from ego"),
+        (0.5, "listed, captured before the onset"),
+        (pytest.approx(1.0, abs=0.04), "onset"),
+        (1, "listed, captured before the onset"),
+        (1.5, "known"),
+    ]
     assert told(path, "late", 0.9)[0] == "2 listed, 0.5 s old"
     assert told(path, "late", 1.0)[0] == "2 listed, 0.5 s old, onset not known yet"
     assert told(path, "late", 1.45)[0] == "2 listed, 0.5 s old, onset not known yet"
     assert told(path, "late", 1.5)[0] == "2 known, 0.5 s old"
     assert told(path, "GT", 0.9)[0] == "2 listed"
     # He who appears at 1.4 s is known to the truth at once.
-    assert at(path, "/world/GT/status", 1.4)["Points3D:labels"] == ["2 known", "3 known"]
+    assert told(path, "GT", 1.4) == ["2 known", "3 known"]
+    assert labels(path, "GT", 1.4) == ["2", "3"]
+    assert labels(path, "late", 0.9) == ["2 listed"]
+    assert labels(path, "late", 1.2) == ["2 listed, onset not known"]
     counted = [row["Scalars:scalars"][0] for row in rows(path, "/plots/known/GT") if row["elapsed"] < 1.05e9]
     assert counted == [0, 1]
 
@@ -225,15 +240,15 @@ def test_not_confirmed_and_too_late(tmp_path: Path) -> None:
     replay = prepare(waiting(), twice)
     table = replay_block(replay, twice, np.array([0]))
     write_rrd(tmp_path / "x.rrd", replay, twice, [tracks_of_run(replay, twice, 0)], table, SUMMARY, 0)
-    assert lane(tmp_path / "x.rrd", "2 pedestrian", 1) == [(0, "PEM listed, not confirmed"), (0.1, "PEM known")]
+    assert lane(tmp_path / "x.rrd", "2 pedestrian", 1) == [(0, "listed, not confirmed"), (0.1, "known")]
     assert told(tmp_path / "x.rrd", "PEM", 0.0)[0] == "2 listed, not confirmed yet"
     late = experiment(units=units, measure=PERSON, configurations={"late": {"units": ["ego"], "latency_s": 1.0}})
     replay = prepare(waiting(), late)
     table = replay_block(replay, late, np.array([0]))
     assert table.set_index("object_id").loc["3", "ended_by"] == "object_left"
     write_rrd(tmp_path / "y.rrd", replay, late, [tracks_of_run(replay, late, 0)], table, SUMMARY, 0)
-    assert lane(tmp_path / "y.rrd", "3 pedestrian", 0)[2:] == [
-        (2.4, "late listed too late"),
-        (3.3, "late absent"),
+    assert lane(tmp_path / "y.rrd", "3 pedestrian", 0)[-2:] == [
+        (2.4, "listed too late"),
+        (3.3, None),
     ]
     assert "3 listed too late, 1.0 s old" in told(tmp_path / "y.rrd", "late", 2.4)

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from copem_replay.perception.pem.condition import Couple
-from copem_replay.viewer.sensors import outlines
-from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, recording, standing
+from copem_replay.pipeline.prepare import prepare
+from copem_replay.viewer.line_of_sight import sight
+from copem_replay.viewer.sensors import named_units, outlines
+from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import Made, at, chunks, make, rows, static
 
 SURE = {"kind": "constant", "probability": 1.0}
@@ -143,7 +145,7 @@ def test_marks_stay_where_objects_were(passing: Made) -> None:
     [told] = rows(passing.path, "/world/PEM/marks/from")
     assert told["Points3D:labels"] == ["9 detected +0.00 s, 60.0 m"]
     assert told["Points3D:positions"] == [[30, 0, 0]]
-    assert static(passing.path, "/world/PEM/marks/from")["Points3D:show_labels"] == [True]
+    assert static(passing.path, "/world/PEM/marks/from")["Points3D:show_labels"] == [False], "when it is selected"
     colours = [static(passing.path, f"/world/{name}/marks")["Points3D:colors"] for name in ("GT", "PEM")]
     assert colours[0] != colours[1]
     assert not rows(passing.path, "/world/pole/marks")  # he is not in its sector
@@ -190,7 +192,7 @@ def test_marks_on_the_curves(tmp_path: Path) -> None:
         "GT": {"units": "truth", "latency_s": 0.2},
     }
     made = make(tmp_path / "x.rrd", scene, units=units, configurations=configurations, obstacles=[WALL], measure=PERSON)
-    layers = [rows(made.path, f"/plots/visible_share/9/mark\\ {k}") for k in (1, 2, 3)]
+    layers = [rows(made.path, f"/plots/visible_share/9_pedestrian/mark_{k}") for k in (1, 2, 3)]
     assert [len(layer) for layer in layers] == [3, 1, 0]
     # Two at one instant are on two entities; on one spot, the second is smaller.
     assert layers[1][0]["SeriesPoints:marker_sizes"] < layers[0][0]["SeriesPoints:marker_sizes"]
@@ -207,13 +209,26 @@ def test_marks_on_the_curves(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------- names, the eye
 
 
-def test_fixed_units_have_no_names_when_there_are_many(tmp_path: Path) -> None:
+def test_six_units_are_named_in_their_view_and_apart(tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
-    poles = {f"p{k}": {"at": [k, 9], "height_m": 6.0, "ground_z_m": 0, "pem": "all"} for k in range(8)}
-    for some, named in ((dict(list(poles.items())[:7]), True), (poles, False)):
-        made = make(tmp_path / "x.rrd", scene, units={"ego": EGO_UNIT, **some}, measure=PERSON)
-        assert static(made.path, "/world/units/ego")["Points3D:show_labels"] == [True]
-        assert static(made.path, "/world/units/p0")["Points3D:show_labels"] == [named]
+    poles = {f"p{k}": {"at": [4 * k, 9], "height_m": 6.0, "ground_z_m": 0, "pem": "all"} for k in range(24)}
+    units = {"ego": EGO_UNIT, **poles}
+    made = make(tmp_path / "x.rrd", scene, units=units, configurations={"all": {"units": "all"}}, measure=PERSON)
+    assert {static(made.path, f"/world/units/{name}")["Points3D:show_labels"][0] for name in units} == {False}
+    reader = RrdReader(made.path)
+    [blueprint] = reader.blueprints()
+    overrides = [
+        chunk
+        for chunk in reader.stream(store=blueprint)
+        if "Points3D:show_labels" in chunk.to_record_batch().schema.names
+    ]
+    named = list(named_units(made.replay, made.given, np.array([30.0, 0.0, 0.0]), 0.0))
+    assert len(named) == len(overrides) == 6
+    assert named[0] == "ego"
+    numbers = sorted(int(name[1:]) for name in named if name != "ego")
+    assert min(np.diff(numbers)) >= 3, "12 m"
 
 
 def eyes(path: Path) -> list[list[Any]]:
@@ -246,16 +261,38 @@ def test_the_eye_looks_ahead_of_the_ego_and_sees_the_object(tmp_path: Path) -> N
         until_s=2.0,
     )
     made = make(tmp_path / "x.rrd", scene, measure=PERSON)
-    found = eyes(made.path)
-    assert len(found) == 2
-    for position, target in found:
-        assert target == pytest.approx([0, 20, 0.8], abs=0.06)
-        # Two views side by side are each about one and a half times as wide as high.
-        assert in_view(position, target, [0, 30, 0.9], 1.55)
-        assert in_view(position, target, [0, 10, 0.75], 1.55)
-        assert np.linalg.norm(position - target) < 30
-    followed = rows(made.path, "/world/eye")
-    assert [row["Points3D:positions"] for row in followed[:2]] == [[pytest.approx([0, y, 0.75])] for y in (10, 11)]
+    # A view of each configuration in the overview and on its page, and one of each that follows the pedestrian.
+    found = [(position, target) for position, target in eyes(made.path) if not target.any()]
+    assert len(found) == 5
+    of_ego = [position for position, _ in found if np.linalg.norm(position) < 19]
+    assert len(of_ego) == 4
+    for position in of_ego:
+        # As seen from 10 m ahead of the ego, on the ground, steeply: it is 10 m behind, he is 10 m ahead.
+        assert position[2] / np.linalg.norm(position) == pytest.approx(np.sin(np.deg2rad(65)), abs=0.02)
+        assert in_view(position, np.zeros(3), [0, 10, 0.9], 1.55)
+        assert in_view(position, np.zeros(3), [0, -10, 0.75], 1.55)
+    followed = rows(made.path, "/world/eyes/ego")
+    assert [row["Transform3D:translation"] for row in followed[:2]] == [[pytest.approx([0, y, 0])] for y in (10, 11)]
+    # He comes at 1 s; until then the eye that follows him waits there.
+    waits = rows(made.path, "/world/eyes/9_pedestrian")
+    assert [(row["elapsed"] / 1e9, row["Transform3D:translation"]) for row in waits[:2]] == [
+        (0.0, [[0, 30, 0]]),
+        (1.0, [[0, 30, 0]]),
+    ]
+
+
+def test_at_the_start_ego_and_object_are_framed(tmp_path: Path) -> None:
+    """A car 30 m away at 0 s, whose onset is when it is 20 m away: a viewer that opens at 0 s shows both."""
+    from copem_replay.viewer.camera import eye_on, seen_from
+
+    scene = recording(
+        [Thing("ego", "car", standing(0, 0)), Thing("7", "car", driving(30, 0, -5), yaw_rad=np.pi)], until_s=3.0
+    )
+    made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "in_range", "range_m": 20}})
+    eye = eye_on(made.replay, made.given, made.table, made.replay.scene.object_number["7"], 1.55)
+    for x in (0.0, 20.0, 30.0):
+        assert seen_from(eye, np.array([x - eye.ahead_m, 0, 0]), 1.55)
+    assert not seen_from(eye, np.array([200.0, 0, 0]), 1.55)
 
 
 def test_without_an_ego_the_eye_sees_the_unit_and_who_passes_it(tmp_path: Path) -> None:
@@ -265,11 +302,13 @@ def test_without_an_ego_the_eye_sees_the_unit_and_who_passes_it(tmp_path: Path) 
         tmp_path / "x.rrd", scene, units={"pole": pole}, configurations={"pole": {"units": ["pole"]}},
         measure={"onset": {"kind": "appears"}, "distance_to": "pole"},
     )  # fmt: skip
-    [[position, target]] = eyes(made.path)
+    whole = [(position, target) for position, target in eyes(made.path) if target.any()]
+    assert len(whole) == 3, "overview, its own page, units"
     # The last part of its way is more than 40 m from the pole.
-    for place in ([40, 0, 0.75], [20, 20, 0.75], [20, -10, 0.75]):
-        assert in_view(position, target, place, 3.1)
-    assert not list(chunks(made.path, "/world/eye"))
+    places = ([40, 0, 0.75], [20, 20, 0.75], [20, -10, 0.75])
+    all_seen = [all(in_view(position, target, place, 3.1) for place in places) for position, target in whole]
+    assert sum(all_seen) == 2
+    assert not list(chunks(made.path, "/world/eyes/ego"))
 
 
 def test_no_nan_anywhere(passing: Made) -> None:
@@ -284,3 +323,27 @@ def test_no_nan_anywhere(passing: Made) -> None:
         batch = chunk.to_record_batch()
         columns = [batch.column(n).to_pylist() for n in batch.schema.names if ":" in n]
         assert np.isfinite(numbers(columns)).all(), chunk.entity_path
+
+
+POLE_5_HZ = {"at": [9, 9], "height_m": 2.0, "ground_z_m": 0.0, "pem": "sure", "rate_hz": 5, "phase_s": 0.05}
+
+
+def test_what_is_known_and_what_is_near_a_line_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares that units have captured are not computed again, and bodies far from a line of sight are left out."""
+    from copem_replay.viewer import line_of_sight
+
+    turn = np.random.default_rng(5)
+    things = [Thing("ego", "car", driving(0, 0, 3, 0))]
+    for k in range(25):
+        x, y, vx, vy = turn.normal(0, [14, 14, 3, 3])
+        things.append(Thing(str(k), "car" if k % 3 else "pedestrian", driving(x, y, vx, vy), yaw_rad=float(k)))
+    given = experiment(units={"ego": EGO_UNIT, "pole": POLE_5_HZ}, obstacles=[WALL], measure=PERSON)
+    replay = prepare(recording(things, until_s=1.0), given)
+    shown = list(range(1, 13))
+    quick = sight(replay, given, shown, replay.rows_of(np.array(shown)))
+    monkeypatch.setattr(line_of_sight, "is_own", lambda _: True)  # as a model that has to see the whole world
+    whole = sight(replay, given, shown)
+    np.testing.assert_allclose(quick.share, whole.share, rtol=0, atol=1e-12)  # summed in another order
+    for name in ("in_range", "body_ix", "body_m", "place_m"):
+        assert np.array_equal(getattr(quick, name), getattr(whole, name), equal_nan=True), name
+    assert (quick.body_ix != 0).sum() > 30, "many are hidden"

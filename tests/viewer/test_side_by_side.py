@@ -85,11 +85,12 @@ def test_two_folders_beside_each_other(call: Compare, tmp_path: Path) -> None:
     assert [point[:2] for point in way] == [pytest.approx([60, 0], abs=1e-4), pytest.approx([55, 0], abs=1e-4)]
     assert first["LineStrips3D:labels"] == ["2 +0.50 s to b:PEM"]
 
-    more = rows(path, r"/plots/error_difference/2/a\:PEM")
-    assert elapsed_s(more) == pytest.approx(np.arange(15, 31) / 10)
-    assert [row["Scalars:scalars"][0] for row in more] == pytest.approx([0.5] * 16)
-    exact = rows(path, r"/plots/error_difference/2/a\:GT")
-    assert [row["Scalars:scalars"][0] for row in exact] == pytest.approx([0.0] * 31)
+    more = rows(path, r"/plots/error_difference/2_car/a\:PEM")
+    # Medians, each quarter of a second: from 1.5 s on both list it.
+    assert elapsed_s(more) == pytest.approx(np.arange(6, 13) / 4)
+    assert [row["Measurements:values"][0] for row in more] == pytest.approx([0.5] * 7)
+    exact = rows(path, r"/plots/error_difference/2_car/a\:GT")
+    assert [row["Measurements:values"][0] for row in exact] == pytest.approx([0.0] * 13)
 
     (told,) = rows(path, r"/events/difference/a\:PEM")
     assert (told[ELAPSED], told["TextLog:text"]) == (1_500_000_000, ["a:PEM knew 2 car 0.50 s after b:PEM"])
@@ -102,7 +103,7 @@ def test_two_folders_beside_each_other(call: Compare, tmp_path: Path) -> None:
     assert ["drive: run 0: differences to b:PEM"] in [
         value for of in (static(path, entity) for entity in entities if "properties" in entity) for value in of.values()
     ]
-    assert {"b:PEM", "a:PEM", "a:GT", "More error than b:PEM [m]"} <= _views(path)
+    assert {"b:PEM", "a:PEM", "a:GT", "2 car: more error than b:PEM, m"} <= _views(path)
 
     # An existing file is replaced, as the tables of `compare` are.
     assert call(*asked, "--run", "1", "--log", "drive")[0] == 0
@@ -155,7 +156,7 @@ def test_the_units_of_that_run(call: Compare, tmp_path: Path) -> None:
     seen = {}
     for stem, options in (("replay", []), ("replay_4", ["--run", "4"])):
         assert call("compare", "f", "--baseline", "alone", "--rrd", "f.rrd", *options)[0] == 0
-        for entity in ("/world/V2V/boxes", "/world/alone/boxes", "/plots/position_error/9/V2V"):
+        for entity in ("/world/V2V/boxes", "/world/alone/boxes", "/plots/position_error/9_pedestrian/V2V"):
             assert rows(tmp_path / "f.rrd", entity) == rows(tmp_path / "f" / f"{stem}.rrd", entity)
         units = {c.entity_path for c in _all(tmp_path / "f.rrd") if c.entity_path.startswith("/world/units/")}
         assert units == {c.entity_path for c in _all(tmp_path / f"f/{stem}.rrd") if "/world/units/" in c.entity_path}

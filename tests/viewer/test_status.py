@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from copem_replay.viewer.rrd import viewed
+from copem_replay.core.colours import configuration_colours
+from copem_replay.viewer.selection import in_parts
 from copem_replay.viewer.sink import slices
-from copem_replay.viewer.status import STATUSES
-from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
+from copem_replay.viewer.statuses import STATUSES
+from tests.helpers.scenes import EGO_UNIT, Thing, driving, recording, standing
 from tests.viewer.test_line_of_sight import PERSON, SECTOR, WALL, lines
 from tests.viewer.test_rrd import SUMMARY, Made, at, chunks, make, rows, static
 
@@ -23,17 +24,23 @@ EGO_ONLY = {"GT": {"units": "truth"}, "PEM": {"units": ["ego"]}}
 
 
 def told(path: Path, configuration: str, elapsed_s: float) -> list[str]:
-    found: list[str] = at(path, f"/world/{configuration}/status", elapsed_s)["Points3D:labels"]
-    return found
+    """The sentences, which are shown when it is selected."""
+    found: list[str] = at(path, f"/world/{configuration}/status", elapsed_s, "why:why")["why:why"]
+    return sorted(found)
 
 
-def lane(path: Path, who: str, number: int) -> list[tuple[float, str]]:
-    """When a configuration's lane changes, and to what."""
-    found = [
-        (row["elapsed"] / 1e9, row["StateChange:state"][number])
-        for row in rows(path, f"/lanes/{who}".replace(" ", "\\ "))
-    ]
-    return [now for k, now in enumerate(found) if k == 0 or now[1] != found[k - 1][1]]
+def labels(path: Path, configuration: str, elapsed_s: float) -> list[str]:
+    """What is written over the objects."""
+    return sorted(at(path, f"/world/{configuration}/status", elapsed_s, "Points3D:labels")["Points3D:labels"])
+
+
+def lane(path: Path, who: str, number: int) -> list[tuple[float, str | None]]:
+    """When a configuration's lane changes, and to what; None: it says nothing."""
+    from rerun.chunk import RrdReader
+
+    begin = f"/lanes/{who.replace(' ', '_')}/{number + 1}_"
+    [entity] = {chunk.entity_path for chunk in RrdReader(path).stream() if chunk.entity_path.startswith(begin)}
+    return [(row["elapsed"] / 1e9, (row["StateChange:state"] or [None])[0]) for row in rows(path, entity)]
 
 
 # ------------------------------------------------------------------------------- hidden, out of view
@@ -66,7 +73,7 @@ def test_who_is_hidden_and_by_whom(hiding: Made) -> None:
     ]
     # To the middle of the truck, and of the wall, 1 m to 41 m high.
     ego = [0, 0, pytest.approx(1.8)]
-    ends = [line.tolist() for line in lines(at(hiding.path, "/world/PEM/hiding", 0.5))]
+    ends = sorted(line.tolist() for line in lines(at(hiding.path, "/world/PEM/hiding", 0.5)))
     assert ends == [[ego, [-15, 0.5, 1.75]], [ego, [10, 0, 21]]]
     # The truck has left: known. Then the pedestrian has, too.
     assert told(hiding.path, "PEM", 1.2) == ["2 known", "4 hidden from ego by obstacle 0 (share 0.00)"]
@@ -80,24 +87,38 @@ def test_who_is_hidden_and_by_whom(hiding: Made) -> None:
     assert not list(chunks(hiding.path, "/world/both/hiding"))
 
 
+def test_the_labels_are_short(hiding: Made) -> None:
+    assert labels(hiding.path, "PEM", 0.5) == ["2 behind 3", "4 behind obstacle 0"]
+    assert labels(hiding.path, "PEM", 1.2) == ["2", "4 behind obstacle 0"]
+    assert labels(hiding.path, "both", 0.5) == ["2", "4"], "what is known is only named"
+
+
 def test_lanes_tell_when_a_configuration_knew(hiding: Made) -> None:
-    assert lane(hiding.path, "2 pedestrian", 0) == [(0, "GT known"), (1.6, "GT absent")]
-    assert lane(hiding.path, "2 pedestrian", 1) == [(0, "PEM hidden"), (1.0, "PEM known"), (1.6, "PEM absent")]
-    assert lane(hiding.path, "4 pedestrian", 1) == [(0, "PEM hidden")]
-    assert lane(hiding.path, "4 pedestrian", 2) == [(0, "both known")]
-    style = static(hiding.path, "/lanes/2\\ pedestrian")
-    colour_of = dict(zip(style["StateConfiguration:values"], style["StateConfiguration:colors"], strict=True))
-    assert len(colour_of) == 3 * len(STATUSES) + 3, "and before, since and after the look"
-    known = [colour_of[f"{name} known"] >> 8 for name in ("GT", "PEM", "both")]
+    assert lane(hiding.path, "2 pedestrian", 0) == [(0, "known"), (1.6, None)]
+    assert lane(hiding.path, "2 pedestrian", 1) == [(0, "behind 3 (from ego)"), (1.0, "known"), (1.6, None)]
+    assert lane(hiding.path, "4 pedestrian", 1) == [(0, "behind obstacle 0 (from ego)")]
+    assert lane(hiding.path, "4 pedestrian", 2) == [(0, "known")]
+
+    def colour_of(name: str) -> dict[str, int]:
+        style = static(hiding.path, f"/lanes/2_pedestrian/{name}")
+        return dict(zip(style["StateConfiguration:values"], style["StateConfiguration:colors"], strict=True))
+
+    names = ("1_GT", "2_PEM", "3_both")
+    known = [colour_of(name)["known"] >> 8 for name in names]
     boxes = [at(hiding.path, f"/world/{name}/boxes", 1.2)["Boxes3D:colors"][0] >> 8 for name in ("GT", "PEM", "both")]
     assert known == boxes
-    assert len({colour_of[f"{name} hidden"] for name in ("GT", "PEM", "both")}) == 1
+    assert len({colour_of(name)["onset"] for name in names}) == 1
 
 
 def test_lines_from_units_to_what_they_listed(hiding: Made) -> None:
+    # Only from the unit that listed each first: the pole, and the ego when it alone sees the second one.
     ends = [line.tolist() for line in lines(at(hiding.path, "/world/both/listings", 0.5))]
     pole = [0, 50, 6]
-    assert ends == [[pole, [-30, 0, pytest.approx(0.9)]], [pole, [30, 0, pytest.approx(0.9)]]]
+    first = hiding.table[hiding.table["configuration"] == "both"].set_index("object_id")["first_unit"]
+    assert first.to_dict() == {"2": "pole", "4": "pole"}
+    assert sorted(ends) == [[pole, [-30, 0, pytest.approx(0.9)]], [pole, [30, 0, pytest.approx(0.9)]]]
+    later = [line.tolist() for line in lines(at(hiding.path, "/world/both/listings", 1.2))]
+    assert sorted(later) == sorted(ends), "not from the ego, which sees the second one, too"
     [line] = lines(at(hiding.path, "/world/PEM/listings", 1.2))
     assert line.tolist() == [[0, 0, pytest.approx(1.8)], [-30, 0, pytest.approx(0.9)]]
     assert lines(at(hiding.path, "/world/PEM/listings", 1.8)) == []
@@ -132,9 +153,9 @@ def test_out_of_range_beside_the_field_and_seen_but_not_listed(tmp_path: Path) -
     made = make(tmp_path / "x.rrd", scene, pems={"sure": blind}, measure=PERSON)
     assert told(made.path, "PEM", 0.5) == ["6 out of range", "7 outside fields of view", "8 seen by ego, not listed"]
     assert [lane(made.path, f"{k} pedestrian", 1) for k in (6, 7, 8)] == [
-        [(0, "PEM out of view")],
-        [(0, "PEM out of view")],
-        [(0, "PEM visible")],
+        [(0, "out of view")],
+        [(0, "out of view")],
+        [(0, "seen by ego, not listed")],
     ]
 
 
@@ -160,13 +181,17 @@ def test_lists_under_way_and_what_is_stale(tmp_path: Path) -> None:
     assert told(made.path, "late", 0.5) == ["9 known, 0.5 s old"]
     assert told(made.path, "late", 0.7) == ["9 known, 0.7 s old"]
     # The words are where he is, the box where he was half a second before.
-    assert at(made.path, "/world/late/status", 0.7)["Points3D:positions"][0][:2] == pytest.approx([30, 1.4])
+    assert at(made.path, "/world/late/status", 0.7, "Points3D:positions")["Points3D:positions"][0][:2] == pytest.approx(
+        [30, 1.4]
+    )
     [box] = at(made.path, "/world/late/boxes", 0.7)["Boxes3D:centers"]
     assert box[:2] == pytest.approx([30, 0])
     # Gone at 1.1 s, still believed until the list of 1.25 s, which has him no more, arrives.
     assert told(made.path, "late", 1.5) == ["9 known, 0.5 s old"]
-    assert at(made.path, "/world/late/status", 1.5)["Points3D:positions"][0][:2] == pytest.approx([30, 2])
-    assert lane(made.path, "9 pedestrian", 0) == [(0, "late captured"), (0.5, "late known"), (1.75, "late absent")]
+    assert at(made.path, "/world/late/status", 1.5, "Points3D:positions")["Points3D:positions"][0][:2] == pytest.approx(
+        [30, 2]
+    )
+    assert lane(made.path, "9 pedestrian", 0) == [(0, "on its way from pole"), (0.5, "known"), (1.75, None)]
 
 
 # ------------------------------------------------------------------------------- GOSPA, what is left out
@@ -200,29 +225,41 @@ def test_gospa_is_of_the_measured_objects(tmp_path: Path) -> None:
     assert values("late") == pytest.approx([np.sqrt(2)] * 6 + [np.sqrt(3 * 4.5)] * 5)
 
 
-def test_of_many_configurations_the_baselines_and_the_first_others_are_shown(tmp_path: Path) -> None:
-    real = {f"g{k}": {"units": "all", "fusion": {"kind": "gnn"}} for k in range(9)}
-    ideal = {f"i{k}": {"units": "all"} for k in range(2)}
-    given = experiment(configurations={**real, **ideal, "GT": {"units": "truth"}})
-    names = list(given.configurations)
-    assert viewed(given, names) == ["g0", "g1", "g2", "i0", "i1", "GT"]
-    assert viewed(given, names[:6]) == names[:6]
-    ten = experiment(configurations={f"i{k}": {"units": "all"} for k in range(10)} | {"g": real["g0"]})
-    assert viewed(ten, list(ten.configurations)) == ["i0", "i1", "i2", "i3", "i4", "g"]
+def test_six_configurations_a_file_and_nothing_dropped() -> None:
+    names = [f"c{k}" for k in range(1, 19)]
+    parts = in_parts(names)
+    assert [part.path(Path("out/replay_4.rrd")).name for part in parts] == [
+        "replay_4.rrd",
+        "replay_4.configurations_7-12.rrd",
+        "replay_4.configurations_13-18.rrd",
+    ]
+    assert [name for part in parts for name in part.configurations] == names
+    assert [part.infix for part in in_parts(names[:6])] == [""]
+    assert [part.infix for part in in_parts(names[:7])] == ["", ".configurations_7"]
+    beside = in_parts(["base", *names[:7]], "base")
+    assert [part.configurations for part in beside] == [("base", *names[:5]), ("base", *names[5:7])]
+    assert [part.infix for part in beside] == ["", ".configurations_7-8"]
 
 
-def test_what_is_left_out_is_said(tmp_path: Path) -> None:
+def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
     from copem_replay.viewer import write_rrd
+    from copem_replay.viewer.export import EXPORTERS
 
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
     many = {f"GT{k}": {"units": "truth", "latency_s": k / 10} for k in range(8)}
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, configurations=many)
     said = write_rrd(tmp_path / "y.rrd", made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3)
-    assert said == ["y.rrd: without GT6, GT7; `show: {configurations: […]}` chooses up to 6"]
-    text = static(made.path, "/summary")["TextDocument:text"][0]
-    assert "Not in this file: GT6, GT7." in text
-    assert not list(chunks(made.path, "/world/GT6/boxes"))
-    assert list(chunks(made.path, "/world/GT5/boxes"))
+    assert said == ["y.rrd: GT6, GT7 in y.configurations_7-8.rrd"]
+    first, second = tmp_path / "y.rrd", tmp_path / "y.configurations_7-8.rrd"
+    assert [name for kind in EXPORTERS for name in kind.files("y", 8)] == ["y.mcap", first.name, second.name]
+    assert "In further files: y.configurations_7-8.rrd." in static(first, "/summary")["TextDocument:text"][0]
+    assert [bool(list(chunks(path, "/world/GT5/boxes"))) for path in (first, second)] == [True, False]
+    assert [bool(list(chunks(path, "/world/GT6/boxes"))) for path in (first, second)] == [False, True]
+    every = list(configuration_colours(many).values())
+    for path, name, place in ((first, "GT5", 5), (second, "GT6", 6), (second, "GT7", 7)):
+        red, green, blue = every[place]
+        drawn = at(path, f"/world/{name}/boxes", 0.95)["Boxes3D:colors"][0] >> 8
+        assert drawn == red << 16 | green << 8 | blue, "by its place among all"
 
 
 # ------------------------------------------------------------------------------- names, pieces
@@ -236,7 +273,7 @@ def test_long_ids_are_shortened_where_they_are_drawn(tmp_path: Path) -> None:
     )
     made = make(tmp_path / "x.rrd", scene, measure=PERSON, configurations=EGO_ONLY)
     assert told(made.path, "GT", 0.5) == ["8d2f0c5e-a known", "8d2f0c5e-b known"]
-    assert lane(made.path, "8d2f0c5e-a pedestrian", 0) == [(0, "GT known")]
+    assert lane(made.path, "8d2f0c5e-a pedestrian", 0) == [(0, "known")]
 
 
 def test_pieces_are_whole_lists_and_together_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,14 +309,15 @@ def test_an_entry_that_no_object_is_matched_with(tmp_path: Path) -> None:
         assert told(made.path, "gnn", now_s) == ["2 listed by ego, no entry matched"]
         assert told(made.path, "ideal", now_s) == ["2 known, 0.3 s old"]
     assert told(made.path, "gnn", 0.05) == ["2 listed by ego, arrives in 0.3 s"]
-    assert lane(made.path, "2 pedestrian", 1) == [(0.0, "gnn captured"), (0.3, "gnn unmatched")]
+    assert lane(made.path, "2 pedestrian", 1) == [(0.0, "on its way from ego"), (0.3, "unmatched")]
 
 
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
     from copem_replay.viewer.line_of_sight import sight
-    from copem_replay.viewer.status import CAPTURED, KNOWN, LOST, clock_of, status_of
+    from copem_replay.viewer.status import clock_of, status_of
+    from copem_replay.viewer.statuses import CAPTURED, KNOWN, LOST
 
     fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
@@ -305,7 +343,8 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     from dataclasses import replace
 
     from copem_replay.viewer.line_of_sight import sight
-    from copem_replay.viewer.status import LOST, UNMATCHED, VISIBLE, clock_of, status_of
+    from copem_replay.viewer.status import clock_of, status_of
+    from copem_replay.viewer.statuses import LOST, UNMATCHED, VISIBLE
 
     fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
     heard = fused_tracks.heard

@@ -63,6 +63,7 @@ def write_mcap(
     family: Family | None = None,
     window: Window | None = None,
     truth: TruthScene | None = None,
+    colours: Mapping[str, Rgb] | None = None,
 ) -> list[str]:
     """Write `source` with the fused lists of one run added.
 
@@ -71,7 +72,7 @@ def write_mcap(
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
     `window`: of `source` that was read, None: all. `truth`: to be drawn beside them, None: not drawn; nor where a
-    configuration has the name of its topics.
+    configuration has the name of its topics. `colours`: by configuration, None: by their places in `run_tracks`.
 
     Returns notes on what could not be copied, or was replaced.
 
@@ -81,7 +82,7 @@ def write_mcap(
     family = family or Osi()
     rest = iter(run_tracks)
     first = next(rest)  # it tells the configurations and the units
-    colours = configuration_colours(first)
+    colours = colours or configuration_colours(first)
     units = dict.fromkeys(unit for fused_tracks in first.values() for unit in fused_tracks.heard.units)
     numbers = {unit: k + 1 for k, unit in enumerate(units)}
     with atomic_mcap(path, profile=original.profile) as writer:

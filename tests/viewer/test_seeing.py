@@ -1,0 +1,244 @@
+"""Whether a recording can be read: contrast, colours that stay apart, few labels; over all that is in the file.
+
+On the demo, and on the city with 80 road users.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from itertools import combinations, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from copem_replay.core.colours import TRUTH, configuration_colours
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import read
+from copem_replay.pipeline.blocks import replay_block
+from copem_replay.pipeline.expansion import of_run
+from copem_replay.pipeline.one_run import tracks_of_run
+from copem_replay.pipeline.prepare import prepare
+from copem_replay.viewer import palette, write_rrd
+from copem_replay.viewer.lanes import STEADY_S, steady
+from copem_replay.viewer.running import running
+from copem_replay.viewer.statuses import KNOWN, STATUSES
+from tests.oracles.colour import apart_for_a_deuteranope, contrast
+from tests.viewer.test_rrd import SUMMARY, Made
+from tests.viewer.test_status import lane
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "tools"))
+
+import city_traffic  # noqa: E402
+
+MOST_LABELS = 6
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    folder = tmp_path_factory.mktemp("city")
+    asked = Experiment.model_validate(city_traffic.experiment(city_traffic.write(folder)))
+    recording = read(folder / "city.mcap", name="city")
+    given = of_run(asked, recording.scene, 1)
+    replay = prepare(recording, given, onsets_of=asked)
+    made = Made(
+        folder / "replay.rrd",
+        replay,
+        given,
+        tracks_of_run(replay, given, 1),
+        replay_block(replay, given, np.array([1])),
+    )
+
+    write_rrd(made.path, replay, given, [made.run_tracks], made.table, SUMMARY, 1)
+    return made
+
+
+# ------------------------------------------------------------------------------- colours
+
+
+def test_words_and_lines_stand_out_from_the_ground() -> None:
+    words = {"known": palette.NOTICED, "waiting": palette.WAITING, "hidden": palette.HIDES, "ego": palette.EGO}
+    assert {name: contrast(colour, palette.GROUND) >= 4.5 for name, colour in words.items()} == dict.fromkeys(
+        words, True
+    )
+    lines = {
+        "truth": TRUTH, "standing": palette.STANDING, "lane": palette.LANE, "field": palette.FIELD,
+        "onset": palette.ONSET, "difference": palette.DIFFERENCE, **configuration_colours(map(str, range(28))),
+    }  # fmt: skip
+    assert [name for name, colour in lines.items() if contrast(colour, palette.GROUND) < 3] == []
+
+
+def test_statuses_stay_apart_for_deuteranopes() -> None:
+    neutral = {STATUSES[k]: colour for k, colour in palette.STATUS.items()}
+    all_of_them = neutral | {"onset": palette.ONSET, "truth": TRUTH, "ground": palette.GROUND}
+    near = [
+        (a, b) for a, b in combinations(all_of_them, 2) if apart_for_a_deuteranope(all_of_them[a], all_of_them[b]) < 15
+    ]
+    assert near == []
+    for colour in configuration_colours(map(str, range(28))).values():
+        half = palette.status_colour(KNOWN - 1, colour)
+        assert apart_for_a_deuteranope(half, colour) >= 15, "listed and known"
+    # The oracle: black and white are 100 apart, a colour 0 from itself; red and green of one luminance hardly.
+    assert apart_for_a_deuteranope((0, 0, 0), (255, 255, 255)) == pytest.approx(100, abs=0.1)
+    assert contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21)
+    assert apart_for_a_deuteranope((170, 80, 0), (110, 110, 0)) < 15
+
+
+def test_marks_of_differences_use_no_colour_of_a_configuration() -> None:
+    assert palette.DIFFERENCE not in configuration_colours(map(str, range(28))).values()
+
+
+def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
+    """In boxes, lanes, lines, curves, the legend and the figures of the report."""
+    from copem_replay.report.figures.style import appearances
+
+    every = configuration_colours(city.given.configurations)
+    figures = {name: tuple(round(255 * c) for c in one.colour) for name, one in appearances(list(every)).items()}
+    assert figures == every
+    number = {name: r << 16 | g << 8 | b for name, (r, g, b) in every.items()}
+    found = defaultdict(set)
+    for entity, batch in batches(city.path):
+        name = next((name for name in every if f"/world/{name}/boxes" == entity.replace("\\", "")), None)
+        if name and "Boxes3D:colors" in batch.schema.names:
+            for row in batch.column("Boxes3D:colors").to_pylist():
+                found[name] |= {colour >> 8 for colour in row or ()}
+        for kind in ("gospa", "known"):
+            name = next((name for name in every if f"/plots/{kind}/{name}" == entity.replace("\\", "")), None)
+            if name and "SeriesLines:colors" in batch.schema.names:
+                found[name] |= {colour >> 8 for colour in batch.column("SeriesLines:colors").to_pylist()[0]}
+        if entity == "/legend/bars":
+            bars = [colour >> 8 for colour in batch.column("LineStrips2D:colors").to_pylist()[0]]
+            assert bars[: len(every)] == list(number.values())
+        if entity.startswith("/lanes/") and batch.schema.names and "StateConfiguration:values" in batch.schema.names:
+            of = dict(zip(batch.column("StateConfiguration:values").to_pylist()[0],
+                          batch.column("StateConfiguration:colors").to_pylist()[0], strict=True))  # fmt: skip
+            place = int(entity.rsplit("/", 1)[-1].split("_")[0]) - 1
+            assert of.get("known", number[list(every)[place]] << 8) >> 8 == number[list(every)[place]]
+    assert found == {name: {value} for name, value in number.items()}
+
+
+def test_every_ground_is_dark(city: Made) -> None:
+    """Of 3-D views and plots, so that a viewer in its light theme does not hide what is bright."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(city.path)
+    [blueprint] = reader.blueprints()
+    kinds: dict[str, str] = {}
+    grounds = {}
+    for chunk in reader.stream(store=blueprint):
+        batch, path = chunk.to_record_batch(), chunk.entity_path
+        view = "/".join(path.split("/")[:3])
+        if "ViewBlueprint:class_identifier" in batch.schema.names:
+            kinds[view] = batch.column("ViewBlueprint:class_identifier")[0].as_py()[0]
+        for column in ("Background:color", "PlotBackground:color"):
+            if column in batch.schema.names:
+                grounds[view] = batch.column(column)[0].as_py()[0] >> 8
+    drawn = [view for view, kind in kinds.items() if kind in ("3D", "2D", "TimeSeries")]
+    red, green, blue = palette.GROUND
+    assert len(drawn) > 20
+    assert {grounds.get(view) for view in drawn} == {red << 16 | green << 8 | blue}
+
+
+# ------------------------------------------------------------------------------- labels
+
+
+def batches(path: Path) -> list[tuple[str, Any]]:
+    from rerun.chunk import RrdReader
+
+    return [(chunk.entity_path, chunk.to_record_batch()) for chunk in RrdReader(path).stream()]
+
+
+def test_at_most_six_labels_a_view(city: Made) -> None:
+    """At every instant, all entities of a view taken together that show labels; whatever the eye looks at."""
+    per_frame = np.bincount(city.replay.truth.frame_ix)
+    assert per_frame.min() >= 60, "a crowd"
+    silent, labelled = set(), defaultdict(list)
+    for entity, batch in batches(city.path):
+        names = batch.schema.names
+        shown = next((n for n in names if n.endswith(":show_labels")), None)
+        if shown is not None and batch.column(shown).to_pylist()[0] == [False]:
+            silent.add(entity)
+        column = next((n for n in names if n.endswith(":labels") and not n.startswith("StateConf")), None)
+        if entity.startswith("/world/") and column is not None and "elapsed" in names:
+            times = batch.column("elapsed").cast("int64").to_pylist()
+            labelled[entity] += list(zip(times, batch.column(column).to_pylist(), strict=True))
+        elif entity.startswith("/world/") and column is not None:
+            labelled[entity] += [(0, batch.column(column).to_pylist()[0])]
+    loud = set(labelled) - silent
+    assert {entity.rsplit("/", 1)[-1] for entity in loud} == {"status"}, "only what is told of objects of interest"
+    wanted = {city.replay.scene.object_ids[k] for k in range(len(city.replay.scene.object_ids))}
+    for entity in loud:
+        assert max(len(told or ()) for _, told in labelled[entity]) <= MOST_LABELS
+        who = {label.split(" ")[0] for _, told in labelled[entity] for label in told or ()}
+        assert who <= wanted
+        assert len(who) <= MOST_LABELS
+        assert max(len(label) for _, told in labelled[entity] for label in told or ()) <= 30, "short"
+
+
+def test_paths_of_lanes_and_plots_need_no_escapes(city: Made) -> None:
+    paths = {entity for entity, _ in batches(city.path) if entity.startswith("/lanes/")}
+    assert len(paths) == 6 * 5
+    assert not any("\\" in path or "[" in path for path in paths)
+    assert {path.split("/")[2].split("_")[1] for path in paths} <= {"car", "pedestrian"}
+
+
+# ------------------------------------------------------------------------------- who knew when
+
+
+def test_no_lane_of_the_city_says_known_before_the_table(city: Made) -> None:
+    """For every object that is shown and every configuration."""
+    table = city.table.set_index(["configuration", "object_id"])
+    shown = {entity.split("/")[2].split("_")[0] for entity, _ in batches(city.path) if entity.startswith("/lanes/")}
+    assert len(shown) == 6
+    held = 0
+    for c, name in enumerate(city.given.configurations):
+        for who in shown:
+            kind = table.loc[(name, who), "object_class"]
+            known = [time_s for time_s, said in lane(city.path, f"{who} {kind}", c) if said == "known"]
+            episode = table.loc[(name, who)]
+            assert known[:1] == ([pytest.approx(episode["detection_s"], abs=1e-9)] if episode["detected"] else [])
+            held += bool(known)
+    assert held > 15
+
+
+@given(st.lists(st.tuples(st.integers(1, 12), st.integers(1, len(STATUSES) - 1)), min_size=1, max_size=30))
+@settings(max_examples=150, deadline=None)
+def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -> None:
+    """Tenths of a second each status lasts: spans are long, or the first of all, or the first known."""
+    lasts, what = np.array([r for r, _ in runs]), np.array([s for _, s in runs])
+    elapsed = np.append(0, np.cumsum(lasts)[:-1]) * 100_000_000
+    spans = steady(elapsed, what)
+    assert spans[0].first == 0
+    assert spans[-1].end == len(what)
+    assert all(a.end == b.first and a.status != b.status for a, b in pairwise(spans))
+    known = np.flatnonzero(what == KNOWN)
+    begun = [span.first for span in spans if span.status == KNOWN]
+    assert begun[:1] == known[:1].tolist()
+    # Every status that lasts is told from where it begins.
+    merged = np.append(True, what[1:] != what[:-1])
+    for first in np.flatnonzero(merged):
+        end = next((k for k in range(first + 1, len(what)) if merged[k]), len(what))
+        if lasts[first:end].sum() / 10 >= STEADY_S:
+            assert any(span.first <= first < span.end and span.status == what[first] for span in spans)
+
+
+# ------------------------------------------------------------------------------- errors
+
+
+def test_a_running_median_against_a_plain_one() -> None:
+    chance = np.random.default_rng(3)
+    elapsed = np.sort(chance.choice(100, 60, replace=False)) * 50_000_000
+    values = chance.normal(size=60)
+    of = running(elapsed, values)
+    assert len(of.elapsed_ns)
+    for now, median, half in zip(of.elapsed_ns.tolist(), of.median, of.half, strict=True):
+        assert now % 250_000_000 == 0
+        near = sorted(v for t, v in zip(elapsed.tolist(), values, strict=True) if abs(t - now) <= 500_000_000)
+        assert median == pytest.approx(np.median(near))
+        low, high = near[round(0.25 * (len(near) - 1))], near[round(0.75 * (len(near) - 1))]
+        assert half == pytest.approx((high - low) / 2)
