@@ -1,4 +1,4 @@
-"""The pictures of the README, made anew: the sample experiment, its recordings in the Rerun viewer, its figures.
+"""The pictures of README and docs, made anew: the sample experiment and a city, in the Rerun viewer; figures.
 
 python tools/pictures.py
 
@@ -14,7 +14,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,18 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs/pictures"
-LARGEST_BYTES = 300_000
-WIDE_PX = 1400
+LARGEST_BYTES = 400_000
+WINDOW = "1280x720"
 BAR_PX = 36
 """Of the viewer's menu, which also says that it runs without a window: cut off."""
+QUESTIONS = {
+    "Who knew when": "who_knew_when.png",
+    "Why not earlier": "why_not_earlier.png",
+    "What each believes": "what_each_believes.png",
+    "How far off": "how_far_off.png",
+    "Units": "where_units_are.png",
+}
+"""By pages of the viewer's layout: what is taken of the city, with 80 road users, at 1280 × 720."""
 AT_S = 3.6
 """Of the recording: 0.6 s after the pedestrian's first step (chosen: some know of him, others not yet)."""
 PATIENCE_S = 60.0
@@ -47,10 +55,13 @@ def main() -> None:
         differences = Path(scratch) / "differences.rrd"
         _differences(folder, differences)
         made = {
-            "replay.png": _seen(folder / "replay.rrd"),
-            "differences.png": _seen(differences),
+            "replay.png": _seen(folder / "replay.rrd", AT_S)["Overview"],
+            "differences.png": _seen(differences, AT_S)["Overview"],
             "runs.png": _drawn(folder),
         }
+        city = Path(scratch) / "city"
+        seen = _seen(city / "replay.rrd", _city(city), list(QUESTIONS))
+        made |= {QUESTIONS[page]: picture for page, picture in seen.items()}
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in made.items():
         content = as_png(picture)
@@ -76,6 +87,21 @@ def _replay(folder: Path) -> None:
     write_results(folder, experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
 
 
+def _city(folder: Path) -> float:
+    """The city's results; when some know of the object that tells most, and others do not."""
+    import copem_replay as cr
+    from city_traffic import experiment, write
+    from copem_replay.viewer.selection import measured
+
+    result = cr.run(experiment(write(folder.parent)))
+    result.save(folder)
+    table = result.detections
+    table = table[table["run"] == next(iter(cr.load_results(folder).provenance.run_shown.values()))]
+    episodes = table[(table["object_id"] == measured(table, ["GT"])[0]) & (table["configuration"] != "GT")]
+    times = episodes["detection_s"].dropna()
+    return float(times.min() + times.max()) / 2
+
+
 def _differences(folder: Path, out: Path) -> None:
     """`copem-replay compare --rrd`: two latencies beside the car's own perception."""
     from copem_replay.viewer.side_by_side import write_beside
@@ -92,26 +118,44 @@ def _drawn(folder: Path) -> Picture:
     return Image.open(content)
 
 
-def _seen(recording: Path) -> Picture:
-    """The whole viewer with a recording open, when all of it is drawn."""
+def _seen(recording: Path, at_s: float, pages: Sequence[str] = ("Overview",)) -> dict[str, Picture]:
+    """The whole viewer with a recording open, on each of some pages, when all of it is drawn."""
+    found = {}
     with _viewer() as viewer:
         viewer.open(str(recording))
-        _until(lambda: not viewer.get_state().loading)
-        viewer.set_time("elapsed", duration=AT_S, play_state="paused")
-        same: list[bytes] = []
-
-        def settled() -> bool:
-            shot = viewer.take_screenshot()
-            same[:] = [*same, shot] if same and same[-1] == shot else [shot]
-            return len(same) == SETTLED
-
-        _until(settled)
+        _until(lambda: viewer.get_state().views and not viewer.get_state().loading)
+        viewer.set_time("elapsed", duration=at_s, play_state="paused")
+        for page in pages:
+            _turn_to(viewer, page)
+            found[page] = _settled(viewer)
         broken = [view.name for view in viewer.get_state().views if any(r.severity == "error" for r in view.reports)]
     if broken:
         sys.exit(f"{recording.name}: the viewer could not draw {', '.join(broken)}")
+    return found
+
+
+def _turn_to(viewer: Any, page: str) -> None:
+    """Make one of the layout's tabs the active one."""
+    layout = viewer.get_blueprint().blueprint
+    tabs = layout[f"/container/{layout['/viewport']['ViewportBlueprint']['root_container']}"]["ContainerBlueprint"]
+    for content in tabs["contents"]:
+        if layout["/" + content.lstrip("/")].get("ContainerBlueprint", {}).get("display_name") == page:
+            tabs["active_tab"] = content
+    viewer.set_blueprint(layout, "recording")
+    time.sleep(1.0)
+
+
+def _settled(viewer: Any) -> Picture:
+    same: list[bytes] = []
+
+    def settled() -> bool:
+        shot = viewer.take_screenshot()
+        same[:] = [*same, shot] if same and same[-1] == shot else [shot]
+        return len(same) == SETTLED
+
+    _until(settled)
     whole = Image.open(io.BytesIO(same[-1])).convert("RGB")
-    cut = whole.crop((0, BAR_PX, whole.width, whole.height))
-    return cut.resize((WIDE_PX, round(cut.height * WIDE_PX / cut.width)), Image.Resampling.LANCZOS)
+    return whole.crop((0, BAR_PX, whole.width, whole.height))
 
 
 @contextmanager
@@ -124,11 +168,17 @@ def _viewer() -> Iterator[Any]:
     # The program itself: the script of that name would leave it running when it is stopped.
     import rerun_cli
 
-    program = str(Path(rerun_cli.__file__).with_name("rerun"))
-    with redirect_stdout(sys.stderr):
-        viewer = ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True, executable_path=program)
-    with viewer as opened:
-        yield opened
+    with tempfile.TemporaryDirectory() as scratch:
+        program = Path(scratch) / "viewer"  # the client has no option for the size
+        real = Path(rerun_cli.__file__).with_name("rerun")
+        program.write_text(f'#!/bin/sh\nexec "{real}" --window-size {WINDOW} "$@"\n')
+        program.chmod(0o755)
+        with redirect_stdout(sys.stderr):
+            viewer = ViewerClient.spawn(
+                headless=True, port=port, hide_welcome_screen=True, executable_path=str(program)
+            )
+        with viewer as opened:
+            yield opened
 
 
 def _until(done: Any) -> None:
@@ -140,11 +190,14 @@ def _until(done: Any) -> None:
 
 
 def as_png(picture: Picture) -> bytes:
-    """As few bytes as a picture of few colours needs. Exits where that is too many for a README."""
+    """In its own colours if that is small enough, else in 256. Exits where that is too many bytes for a page."""
     content = io.BytesIO()
-    # Not by how often a colour is there: nearly all of a dark window is nearly black.
-    few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    few.save(content, format="png", optimize=True)
+    picture.convert("RGB").save(content, format="png", optimize=True)
+    if content.tell() > LARGEST_BYTES:
+        content = io.BytesIO()
+        # Not by how often a colour is there: nearly all of a dark window is nearly black.
+        few = picture.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(content, format="png", optimize=True)
     if content.tell() > LARGEST_BYTES:
         sys.exit(f"a picture of {content.tell()} bytes: expected at most {LARGEST_BYTES}")
     return content.getvalue()
