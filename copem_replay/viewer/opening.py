@@ -28,7 +28,7 @@ HOST = "127.0.0.1"
 READY_S, AGAIN_S = 60.0, 0.2
 """How long a viewer may take to load a recording, and how often it is asked whether it has (chosen)."""
 _PATTERNS = ("replay.rrd", "replay.*.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
-_PART = re.compile(r"\.configurations_\d+-\d+$")
+_PART = re.compile(r"\.configurations_\d+(-\d+)?$")
 
 
 def recordings_of(folder: Path) -> list[Path]:
