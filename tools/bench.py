@@ -196,6 +196,7 @@ def fusion() -> Iterator[dict[str, object]]:
     experiment, recordings = _loaded(ROOT / "logs/crossing.yaml")
     yield from bench_fusion.crossing(best, experiment, recordings[0])
     yield from bench_fusion.gnn_growth(best)
+    yield from bench_fusion.combining(best)
 
 
 def peers() -> Iterator[dict[str, object]]:

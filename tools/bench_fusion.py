@@ -47,8 +47,11 @@ _VAGUE_M2 = 1e6  # prior of a founding position: as good as none
 MISSING = {"why": "stonesoup is not installed: pip install '.[bench]'"}
 
 
-def scene(objects: int, units: int, count: int, seed: int = 0) -> tuple[Inputs, Float]:
-    """What `units` report in one run at `count` instants, at once; where the objects are (count, objects, 2)."""
+def scene(objects: int, units: int, count: int, seed: int = 0, common: float = 0.0) -> tuple[Inputs, Float]:
+    """What `units` report in one run at `count` instants, at once; where the objects are (count, objects, 2).
+
+    `common`: of the variance of the errors about an object, this share is one and the same for all units and instants.
+    """
     rng = np.random.default_rng(seed)
     place, speed = rng.uniform(0, 10 * math.sqrt(objects), (objects, 2)), rng.normal(0, 2, (objects, 2))
     now_s = np.arange(count) * PERIOD_S
@@ -56,7 +59,10 @@ def scene(objects: int, units: int, count: int, seed: int = 0) -> tuple[Inputs, 
     seen = rng.random((count, units, objects)) < 0.8
     instant, unit, which = np.nonzero(seen)
     entries = entries_of(len(which))
-    entries["x_m"], entries["y_m"] = (truth[instant, which] + rng.normal(size=(len(which), 2))).T
+    error = rng.normal(size=(len(which), 2))
+    if common > 0:
+        error = math.sqrt(1 - common) * error + math.sqrt(common) * rng.normal(size=(objects, 2))[which]
+    entries["x_m"], entries["y_m"] = (truth[instant, which] + error).T
     for name, variance in zip(COVARIANCES, (1.0, 0.0, 1.0), strict=True):
         entries[name] = variance
     entries["length_m"], entries["width_m"], entries["height_m"] = 4.5, 1.9, 1.5
@@ -145,6 +151,57 @@ def gnn_growth(best: Best) -> Iterator[Line]:
     yield {"gnn_growth": round(took[160, 20] / took[10, 20], 1), "bound_objects_squared": 256}
     # The first list of an instant meets nobody: 19 to be assigned, and 4.
     yield {"gnn_growth_with_units": round(took[40, 20] / took[40, 5], 2), "lists_to_assign": 4.75}
+
+
+COMBINED: tuple[tuple[str, ListFusion], ...] = (
+    ("gnn inverse_variance", Gnn(gate=GATE)),
+    ("gnn covariance_intersection", Gnn(gate=GATE, combine="covariance_intersection")),
+    ("gnn fast_covariance_intersection", Gnn(gate=GATE, combine="fast_covariance_intersection")),
+    ("gnn inverse_covariance_intersection", Gnn(gate=GATE, combine="inverse_covariance_intersection")),
+    ("gnn split_covariance_intersection", Gnn(gate=GATE, combine="split_covariance_intersection")),
+    ("gnn cross_covariance", Gnn(gate=GATE, combine="cross_covariance")),
+    ("gnn covariance_union", Gnn(gate=GATE, combine="covariance_union")),
+    ("tracker", Tracker(confirm_s=0.0)),
+    ("tracker errors_last_s 1", Tracker(confirm_s=0.0, errors_last_s=1.0)),
+    ("tracker common_share 0.5", Tracker(confirm_s=0.0, common_share=0.5)),
+)
+
+
+def combining(best: Best, objects: int = 15, units: int = 6, count: int = 100) -> Iterator[Line]:
+    """Each way to combine, by time, and how true it is where half of every variance is common to all units.
+
+    RMSE and NEES (2: honest) over the entries within 5 m of an object, all instants, of the one next to each.
+    """
+    told, truth = scene(objects, units, count, common=0.5)
+    for name, fusion in COMBINED:
+        found = fusion.fuse(told)
+        seconds = best(lambda fusion=fusion: fusion.fuse(told), 5)
+        error, cov = _next_to(truth, found)
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean()
+        yield {
+            "combine": name,
+            "us_per_list": round(seconds / count * 1e6, 1),
+            "entries_per_object": round(len(found.entries) / (count * objects), 3),
+            "rmse_m": round(math.sqrt((error**2).sum(axis=1).mean()), 3),
+            "nees": round(float(nees), 2),
+        }
+
+
+def _next_to(truth: Float, found: ObjectLists) -> tuple[Float, Float]:
+    """Errors (N, 2) and covariances (N, 2, 2) of the entry next to each object, where one is within 5 m."""
+    errors, covariances = [np.empty((0, 2))], [np.empty((0, 2, 2))]
+    for k, places in enumerate(truth):
+        entries = found.of(0, k)
+        if len(entries) == 0:
+            continue
+        off = np.stack([entries["x_m"], entries["y_m"]], axis=1)[None] - places[:, None]
+        nearest = (off**2).sum(axis=2).argmin(axis=1)
+        error = off[np.arange(len(places)), nearest]
+        close = (error**2).sum(axis=1) <= 25.0
+        cov = np.stack([entries[f"cov_{name}_m2"] for name in ("ee", "en", "en", "nn")], axis=1).reshape(-1, 2, 2)
+        errors.append(error[close])
+        covariances.append(cov[nearest][close])
+    return np.concatenate(errors), np.concatenate(covariances)
 
 
 # -------------------------------------------------------------------------------------------------------------- a peer

@@ -526,8 +526,14 @@ CASES = [
     (COPEM, "fusion: {kind: nms, by: size}", ".fusion.by: expected 'iou' or 'centre', found 'size'"),
     (COPEM, "fusion: {kind: nms, radius: 2}", ".fusion.radius: unknown key; did you mean radius_m?"),
     (COPEM, "fusion: {kind: gnn, combine: samples}",
-     ".fusion.combine: expected 'inverse_variance', 'covariance_intersection' or 'fast_covariance_intersection', found "
-     "'samples'"),
+     ".fusion.combine: expected 'inverse_variance', 'covariance_intersection', 'fast_covariance_intersection', "
+     "'inverse_covariance_intersection', 'split_covariance_intersection', 'cross_covariance' or 'covariance_union', "
+     "found 'samples'"),
+    (COPEM, "fusion: {kind: gnn, correlation: 0.5}",
+     ".fusion: correlation: expected only with combine: cross_covariance, found with inverse_variance"),
+    (COPEM, "fusion: {kind: gnn, combine: cross_covariance, correlation: 1}",
+     ".fusion.correlation: expected less than 1, found 1"),
+    (COPEM, "fusion: {kind: tracker, common_share: 2}", ".fusion.common_share: expected at most 1, found 2"),
     (COPEM, "fusion: {kind: gnn, gate: 1}", ".fusion.gate: expected less than 1, found 1"),
     (COPEM, "fusion: {kind: tracker, late: never}",
      ".fusion.late: expected 'stale', 'predict' or 'replay', found 'never'"),
