@@ -128,12 +128,27 @@ def ground_at(truth: Tracks, corners: Float) -> float | None:
 
     if not len(truth.frame_ix):
         return None
+    near = _may_be_nearest(truth.x_m[0], truth.y_m[0], corners)
     place = shapely.Point(corners[0]) if len(corners) == 1 else shapely.Polygon(corners)
-    distance = shapely.distance(place, shapely.points(truth.x_m[0], truth.y_m[0]))
-    nearest = int(np.argmin(distance))
-    if distance[nearest] > GROUND_WITHIN_M:
+    distance = shapely.distance(place, shapely.points(truth.x_m[0, near], truth.y_m[0, near]))
+    nearest = near[np.argmin(distance)]
+    if distance.min() > GROUND_WITHIN_M:
         return None
     return float(truth.z_m[0, nearest] - truth.height_m[0, nearest] / 2)
+
+
+def _may_be_nearest(x_m: Float, y_m: Float, corners: Float) -> Int:
+    """Which states (R,) to ask: those whose distance from the corners' bounds is within the least from a corner.
+
+    To build a geometry of each state takes most of the time, and most are farther away.
+    """
+    (west, south), (east, north) = corners.min(axis=0), corners.max(axis=0)
+    outside = np.hypot(
+        np.maximum(np.maximum(west - x_m, x_m - east), 0), np.maximum(np.maximum(south - y_m, y_m - north), 0)
+    )
+    reach = min(float(np.hypot(x_m - x, y_m - y).min()) for x, y in corners)
+    near = np.flatnonzero(outside <= reach * (1 + 1e-9))
+    return near if len(near) else np.arange(len(x_m))
 
 
 def unit_ground(truth: Tracks, name: str, unit: Placement, notes: list[str]) -> float:
