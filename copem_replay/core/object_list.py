@@ -7,6 +7,7 @@ K instants at which the receiver issues a fused list, U units, N entries of all 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -45,6 +46,21 @@ Entries = NDArray[Any]
 
 TellsOf = Literal["capture", "now"]
 """Of which instant an entry tells: of its newest capture, or of the instant its list is available."""
+
+
+def taken(entries: Entries, rows: Int) -> Entries:
+    """The entries at these rows. As words of memory, several times as fast as NumPy copies them, field by field."""
+    return _words(entries)[rows].view(ENTRY)[:, 0]
+
+
+def joined(parts: Sequence[Entries]) -> Entries:
+    """All entries one after the other, copied as `taken` does."""
+    return np.concatenate([_words(entries_of(0)), *map(_words, parts)]).view(ENTRY)[:, 0]
+
+
+def _words(entries: Entries) -> Int:
+    words: Int = np.ascontiguousarray(entries).view(np.int64).reshape(len(entries), ENTRY.itemsize // 8)
+    return words
 
 
 def entries_of(count: int) -> Entries:

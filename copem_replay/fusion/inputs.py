@@ -12,7 +12,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, taken
 from copem_replay.core.tracks import VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floored
 
@@ -39,7 +39,7 @@ def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[
     picked = np.empty(int(valid.sum()), dtype=np.int64)
     _pick(valid, drawn, order, bounds, start, picked)
     template = _template(heard, claims)
-    entries = template[picked]
+    entries = taken(template, picked)
     run = np.repeat(np.arange(len(valid)), valid.sum(axis=1))
     for name in VALUES:
         values = getattr(heard, name)

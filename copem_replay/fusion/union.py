@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.components import Share
-from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
+from copem_replay.core.object_list import Entries, Inputs, ObjectLists, joined, taken
 from copem_replay.core.tracks import Bool, Int
 from copem_replay.fusion.base import ListFusion
 
@@ -31,7 +31,7 @@ class Union(ListFusion):
         for bounds in inputs.lists.start:
             entries = inputs.lists.entries[bounds[0] : bounds[-1]]
             start, rows = side_by_side(bounds - bounds[0], inputs.newest, entries["existence"] >= self.min_existence)
-            runs.append((start, entries[rows]))
+            runs.append((start, taken(entries, rows)))
         fused = run_after_run(runs, len(inputs.issue_s))
         # Two units' numbers of tracks have nothing to do with each other.
         fused.entries["track_id"] = -1
@@ -45,7 +45,7 @@ def run_after_run(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectL
     for s, (one, _) in enumerate(runs):
         start[s] = total + one
         total += int(one[-1])
-    return ObjectLists(start, np.concatenate([entries_of(0), *(entries for _, entries in runs)]))
+    return ObjectLists(start, joined([entries for _, entries in runs]))
 
 
 @nb.njit(cache=True, nogil=True)
