@@ -192,7 +192,9 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
     lists, notes = {}, list(recording.notes)
     for name, asked in experiment.recorded.items():
         try:
-            lists[name], said = recorded_unit(recording, name, asked)
+            lists[name], said = recorded_unit(
+                recording, name, asked, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
+            )
             notes += said
         except RecordingError as error:
             at = ("units", name, "recorded")

@@ -20,16 +20,14 @@ from copem_replay.core.interpolation import at_instants
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.io.config import Recorded
+from copem_replay.io.list_checks import delay_of, delay_words, odd_about
+from copem_replay.io.plausibility import MAX_GAP_S
 from copem_replay.io.recorded_lists import read_listed
 from copem_replay.io.recorded_osi import RecordedLists, read_recorded
 from copem_replay.io.recording import Recording
 
-MOVING_MPS = 2.0
-"""A track moves that is faster than this, and its unit says so (chosen: jitter of a place is not)."""
 OWN_BODY_M = 0.5
 """So far beside the ego's box the centre of its own body is listed (chosen: nobody else's can be that near)."""
-MOSTLY = 0.8
-"""More than this share of entries is no chance (chosen)."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,9 @@ class RecordedUnits:
         )
 
 
-def recorded_unit(recording: Recording, name: str, asked: Recorded) -> tuple[RecordedLists, list[str]]:
+def recorded_unit(
+    recording: Recording, name: str, asked: Recorded, *, gate_m: float = 3.0, max_gap_s: float = MAX_GAP_S
+) -> tuple[RecordedLists, list[str]]:
     """A unit's lists with all that is asked for, in the window and frames of the truth, and what has to be said.
 
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
@@ -97,30 +97,16 @@ def recorded_unit(recording: Recording, name: str, asked: Recorded) -> tuple[Rec
     tracks = replace(
         tracks, units=(name,), stamp_ns=stamp_ns, captured_s=(stamp_ns - scene.t0_ns) * np.float64(1e-9), **columns
     )
-    backwards = _backwards(found)
-    if backwards is not None and backwards > MOSTLY:
-        notes.append(
-            f"unit {name}: its velocities point against the way its own tracks move ({backwards:.0%} of its entries); "
-            "what goes by them (`tracker` with `late: predict`, new tracks) is led astray"
-        )
+    if not found.capture_said.all():
+        delay = delay_of(found, scene, recording.truth)
+        if delay.untold is None and not delay.low_s <= asked.delay_s <= delay.high_s:
+            notes.append(
+                f"unit {name}: delay_s is {asked.delay_s:g}, but its entries fit the truth at {delay_words(delay)}"
+            )
+    told = with_truth_ids(replace(found, tracks=tracks), scene, recording.truth, gate_m=gate_m, max_gap_s=max_gap_s)
+    notes += [f"unit {name}: {line}" for line in odd_about(found, told.row_object_ix, scene)]
     existence = np.where(np.isnan(found.existence), asked.existence, found.existence)
     return replace(found, tracks=tracks, existence=np.clip(existence, 0.0, 1.0)), notes
-
-
-def _backwards(found: RecordedLists) -> float | None:
-    """Of the entries of moving tracks the share whose velocity points against their way; None: nothing moves."""
-    tracks = found.tracks
-    named = np.flatnonzero(found.track_id >= 0)
-    order = named[np.lexsort((tracks.row_captured_s[named], found.track_id[named]))]
-    same = (np.diff(found.track_id[order]) == 0) & (np.diff(tracks.row_captured_s[order]) > 0)
-    before, after = order[:-1][same], order[1:][same]
-    step_s = tracks.row_captured_s[after] - tracks.row_captured_s[before]
-    east, north = ((getattr(tracks, n)[0, after] - getattr(tracks, n)[0, before]) / step_s for n in ("x_m", "y_m"))
-    vx, vy = tracks.vx_mps[0, after], tracks.vy_mps[0, after]
-    moving = (np.hypot(east, north) > MOVING_MPS) & (np.hypot(vx, vy) > MOVING_MPS)
-    if not moving.any():
-        return None
-    return float(((east * vx + north * vy) < 0)[moving].mean())
 
 
 def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float) -> Tracks:

@@ -97,6 +97,10 @@ def test_survey(path):
                         "covariances_said": True,
                         "captures_said": False,
                         "problem": None,
+                        "delay_s": None,
+                        "delay_interval_s": None,
+                        "delay": "cannot be told: nothing in them can be followed from list to list",
+                        "oddities": [],
                     }
                 ],
                 "suggested": {
@@ -134,6 +138,7 @@ def test_describe(path):
         "  stationary: 1 other",
         "  ego: 4 (car, 4.50 × 2.00 × 1.50 m), 0.000 – 1.500 s",
         "  unit rsu: 2 lists, 0 entries; says not when captured",
+        "    delay_s against the truth cannot be told: nothing in them can be followed from list to list",
         "  note: 1 message of nav_msgs/msg/Odometry not read",
         f"experiment; with comments: copem-replay init {path} > experiment.yaml",
         *(f"  {line}" for line in EXPERIMENT.replace("LOG", str(path)).splitlines()),

@@ -29,6 +29,10 @@ class UnitFound:
     covariances_said: bool = False  # by every entry
     captures_said: bool = False  # by every list
     problem: str | None = None
+    delay_s: float | None = None  # as entries fit the truth best, of lists that do not say when they were captured
+    delay_interval_s: list[float] | None = None  # 95 %
+    delay: str | None = None  # the same in words, or that it cannot be told; None: lists say it
+    oddities: list[str] = field(default_factory=list)  # one line each
 
 
 @dataclass(frozen=True)

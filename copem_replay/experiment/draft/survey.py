@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,6 +35,8 @@ if TYPE_CHECKING:  # it imports much that a recording of the truth alone does no
     from copem_replay.io.recorded_osi import RecordedLists
     from copem_replay.io.schemas.description import Fields
 
+GATE_M = 3.0
+"""Farther from a true object an entry is about no object: the default of `measure.match`."""
 _OURS = "copem/"  # what this project wrote beside a recording
 _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"
 
@@ -98,6 +100,7 @@ def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[Un
             yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
             continue
         lists = len(found.tracks.stamp_ns)
+        known = _against_truth(recording, found) if lists else {}
         yield UnitFound(
             topic,
             lists=lists,
@@ -105,7 +108,25 @@ def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[Un
             covariances_said=bool(found.spread_said.all()),
             captures_said=bool(found.capture_said.all()),
             problem=None if lists else "holds no list",
+            **known,
         )
+
+
+def _against_truth(recording: Recording, found: RecordedLists) -> dict[str, Any]:
+    """How late the lists of a unit are, and what is odd about them."""
+    from copem_replay.io.list_checks import captured_before, delay_of, delay_words, odd_about
+    from copem_replay.io.recorded_units import with_truth_ids
+
+    scene, truth, known, delay_s = recording.scene, recording.truth, dict[str, Any](), 0.0
+    if not found.capture_said.all():
+        delay = delay_of(found, scene, truth)
+        known["delay"] = delay_words(delay)
+        if delay.untold is None:
+            known["delay_s"] = delay_s = round(max(delay.offset_s, 0.0), 3)
+            known["delay_interval_s"] = [round(delay.low_s, 3), round(delay.high_s, 3)]
+    shifted = captured_before(found, scene, delay_s)
+    told = with_truth_ids(shifted, scene, truth, gate_m=GATE_M, max_gap_s=MAX_GAP_S)
+    return known | {"oddities": list(odd_about(found, told.row_object_ix, scene))}
 
 
 def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:

@@ -96,5 +96,8 @@ def _truth_lines(truth: TruthFound) -> list[str]:
         unsaid += [] if unit.captures_said else ["not when captured"]
         said = f"{counted(unit.lists, 'list')}, {counted(unit.entries, 'entry', 'entries')}"
         lines.append(f"  unit {unit.topic}: {said}" + (f"; says {' and '.join(unsaid)}" if unsaid else ""))
+        if unit.delay is not None:
+            lines.append(f"    delay_s against the truth {'' if unit.delay_s is None else 'is '}{unit.delay}")
+        lines += [f"    {line}" for line in unit.oddities]
     lines += [f"  missing: {line}" for line in truth.missing]
     return lines + [f"  note: {line}" for line in truth.notes]

@@ -208,7 +208,9 @@ def _units(
         yield "  # Lists as they were recorded. `delay_s`, `covariance_m2`: for messages that don't say when they were"
         yield "  # captured, and how uncertain they are."
     for name, unit in recorded:
-        yield f"  {name}: {{recorded: {_recorded_value(unit)}}}"
+        yield from (f"  # {_plain(line)}" for line in unit.oddities)
+        late = "" if unit.delay is None else f"   # delay_s {_plain(unit.delay)}"
+        yield f"  {name}: {{recorded: {_recorded_value(unit)}}}{late}"
     for unit in lists:
         if unit.problem:
             yield f"  # {quoted(unit.topic)} cannot be a unit: {_plain(unit.problem)}"
@@ -267,7 +269,7 @@ def _recorded(truth: TruthFound) -> list[tuple[str, UnitFound]]:
 
 def _recorded_value(unit: UnitFound) -> str:
     parts = [f"topic: {quoted(unit.topic)}"]
-    parts += [] if unit.captures_said else ["delay_s: 0.0"]
+    parts += [] if unit.captures_said else [f"delay_s: {unit.delay_s or 0.0}"]
     parts += [] if unit.covariances_said else [f"covariance_m2: {_UNIT}"]
     return f"{{{', '.join(parts)}}}"
 

@@ -1,0 +1,211 @@
+"""Object lists as points in time and space, followed from list to list and smoothed: place and velocity at any instant.
+
+Ids are used where all entries have one; else an entry follows the one of an earlier list that it is nearest to where
+that was heading. States are of a parabola through what is near in time, so that errors of single entries average out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from copem_replay.core.tracks import Float, Int, Tracks
+
+WINDOW_S = 0.75
+"""So far to both sides states are smoothed (chosen: errors of half a metre leave a velocity good to 0.3 m/s)."""
+SLOWEST_HZ = 0.5
+"""Lists that come less often are not followed (chosen)."""
+_EACH_SIDE = 2  # entries before and after an instant, at least: at the end of a track a velocity is a guess (chosen)
+_FASTEST_MPS = 60.0
+_SETTLED_S = 0.2  # so long it takes until an entry has changed where a track is taken to be (chosen)
+_APART_M = 1e5  # lists lie so far apart in the tree that no entry is near one of another list
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Entries of object lists, (P,) each, in order of time. `list_ix`: of ascending lists, `track`: −1 without ids."""
+
+    time_s: Float
+    list_ix: Int
+    x_m: Float
+    y_m: Float
+    track: Int
+
+    def thinned(self, most: int) -> Entries:
+        """About so many of them, whole lists."""
+        every = -(-len(self.time_s) // most)
+        return self.take(np.flatnonzero(self.list_ix % every == 0)) if every > 1 else self
+
+    def take(self, rows: Int) -> Entries:
+        """Some of them."""
+        return Entries(self.time_s[rows], self.list_ix[rows], self.x_m[rows], self.y_m[rows], self.track[rows])
+
+
+def entries_of(tracks: Tracks, t0_ns: int, track: Int | None = None) -> Entries:
+    """Entries of lists, in seconds since `t0_ns`; `track`: the ids of rows, None: the tracks they are in."""
+    ids = tracks.track_ix if track is None else track
+    stamps, list_ix = np.unique(tracks.stamp_ns, return_inverse=True)
+    of_row = list_ix[tracks.frame_ix]
+    order = np.argsort(of_row, kind="stable")
+    time_s = (stamps - t0_ns) * np.float64(1e-9)
+    of_row = of_row[order]
+    return Entries(time_s[of_row], of_row, tracks.x_m[0, order], tracks.y_m[0, order], ids[order])
+
+
+@dataclass(frozen=True)
+class States:
+    """States of tracks, (K,) each; `velocity (2, K)`."""
+
+    x_m: Float
+    y_m: Float
+    velocity: Float
+    track: Int
+
+
+@dataclass(frozen=True)
+class ShortTracks:
+    """Smoothed states in order of tracks and time, (Q,) each; `gap_s`: states further apart say nothing in between."""
+
+    time_s: Float
+    track: Int
+    x_m: Float
+    y_m: Float
+    velocity: Float  # (2, Q)
+    gap_s: float
+
+    def at(self, times_s: Float) -> tuple[States, Int]:
+        """States at instants (F,), ascending, of all tracks that are there, and which instant each is of."""
+        span = float(max(self.time_s.max(), times_s.max()) - min(self.time_s.min(), times_s.min())) + 10
+        begin = np.flatnonzero(np.diff(self.track, prepend=-1))
+        first, last = self.time_s[begin], self.time_s[np.append(begin[1:], len(self.track)) - 1]
+        low, high = np.searchsorted(times_s, first), np.searchsorted(times_s, last, side="right")
+        count = np.maximum(high - low, 0)
+        track = np.repeat(np.arange(len(begin)), count)
+        instant = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
+        axis = self.time_s + np.repeat(np.arange(len(begin)), np.diff(np.append(begin, len(self.track)))) * span
+        before = np.searchsorted(axis, times_s[instant] + track * span, side="right") - 1
+        before = np.clip(before, begin[track], len(axis) - 1)
+        after = np.minimum(before + 1, np.append(begin[1:], len(axis))[track] - 1)
+        long_s = self.time_s[after] - self.time_s[before]
+        there = long_s <= self.gap_s
+        weight = (times_s[instant] - self.time_s[before]) / np.maximum(long_s, 1e-9)
+        before, after, weight = before[there], after[there], np.clip(weight[there], 0.0, 1.0)
+
+        def between(values: Float) -> Float:
+            mixed: Float = values[..., before] * (1 - weight) + values[..., after] * weight
+            return mixed
+
+        states = States(between(self.x_m), between(self.y_m), between(self.velocity), self.track[before])
+        return states, instant[there]
+
+    def nearest(
+        self, other: Entries, offset_s: float, *, gate_m: float, faster_mps: float, mutual: bool = False
+    ) -> tuple[Int, States, Float]:
+        """Which entries, shifted back by an offset, lie near what of these moves: rows, states there, and distances."""
+        stamps_s, at = np.unique(other.time_s, return_inverse=True)
+        states, instant = self.at(stamps_s - offset_s)
+        moving = np.flatnonzero(np.hypot(*states.velocity) > faster_mps)
+        # What stands still is matched, too: it must not be taken for something that passes by.
+        mine = np.stack([other.x_m, other.y_m, at * _APART_M], axis=1)
+        theirs = np.stack([states.x_m, states.y_m, instant * _APART_M], axis=1)
+        if not len(moving):
+            none = np.empty(0, dtype=np.int64)
+            return none, _taken(states, none), np.empty(0)
+        away_m, k = cKDTree(theirs).query(mine, distance_upper_bound=gate_m)
+        rows = np.flatnonzero(np.isfinite(away_m))
+        if mutual and len(rows):
+            _, back = cKDTree(mine).query(theirs[k[rows]], distance_upper_bound=gate_m)
+            rows = rows[back == rows]
+        rows = rows[np.isin(k[rows], moving)]
+        return rows, _taken(states, k[rows]), away_m[rows]
+
+
+def _taken(states: States, rows: Int) -> States:
+    return States(states.x_m[rows], states.y_m[rows], states.velocity[:, rows], states.track[rows])
+
+
+def short_tracks(entries: Entries) -> ShortTracks:
+    """The tracks of object lists."""
+    times_s = np.unique(entries.time_s)
+    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else np.inf
+    gap_s = max(0.5, 2.5 * step_s)
+    if step_s > 1 / SLOWEST_HZ:
+        entries = entries.take(np.empty(0, dtype=np.int64))
+    elif len(entries.track) and entries.track.min() < 0:
+        entries = replace(entries, track=followed(entries, gap_s))
+    order = np.lexsort((entries.time_s, entries.track))
+    entries = entries.take(order)
+    new = (np.diff(entries.track, prepend=-1) != 0) | (np.diff(entries.time_s, prepend=-np.inf) > gap_s)
+    # A jump is another object under the same id.
+    jump_m = np.hypot(np.diff(entries.x_m, prepend=np.nan), np.diff(entries.y_m, prepend=np.nan))
+    new |= jump_m > _FASTEST_MPS * np.diff(entries.time_s, prepend=-np.inf) + 3.0
+    return _smoothed(entries, np.cumsum(new) - 1, max(WINDOW_S, 2.5 * step_s), gap_s)
+
+
+def _smoothed(entries: Entries, track: Int, window_s: float, gap_s: float) -> ShortTracks:
+    """Parabolas through what is near in time, where there is enough on both sides."""
+    time_s = entries.time_s
+    if not len(time_s):
+        return ShortTracks(time_s, track, entries.x_m, entries.y_m, np.empty((2, 0)), gap_s)
+    axis = time_s + track * (float(np.ptp(time_s)) + 10 * window_s)
+    low, high = np.searchsorted(axis, axis - window_s), np.searchsorted(axis, axis + window_s, side="right")
+    here = np.arange(len(axis))
+    kept = np.flatnonzero((here - low >= _EACH_SIDE) & (high - here > _EACH_SIDE))
+    sums = [np.zeros(len(kept)) for _ in range(5)]
+    right = np.zeros((2, 3, len(kept)))
+    widest = int((high - low)[kept].max()) if len(kept) else 0
+    for n in range(widest):
+        row = low[kept] + n
+        inside = row < high[kept]
+        row = np.minimum(row, len(axis) - 1)
+        t = np.where(inside, axis[row] - axis[kept], 0.0)
+        for power in range(5):
+            sums[power] += np.where(inside, t**power, 0.0)
+        for axis_ix, values in enumerate((entries.x_m, entries.y_m)):
+            away = np.where(inside, values[row] - values[kept], 0.0)  # small numbers keep their digits
+            for power in range(3):
+                right[axis_ix, power] += away * t**power
+    normal = np.array([[sums[i + j] for j in range(3)] for i in range(3)]).transpose(2, 0, 1)
+    solved = np.linalg.solve(normal, right.transpose(2, 1, 0)) if len(kept) else np.empty((0, 3, 2))
+    x_m, y_m = entries.x_m[kept] + solved[:, 0, 0], entries.y_m[kept] + solved[:, 0, 1]
+    return ShortTracks(time_s[kept], track[kept], x_m, y_m, solved[:, 1].T, gap_s)
+
+
+def followed(entries: Entries, gap_s: float) -> Int:
+    """(P,) tracks of entries without ids: each follows the track that is nearest to it where that was heading."""
+    track = np.full(len(entries.time_s), -1)
+    bounds = np.flatnonzero(np.diff(entries.list_ix, prepend=-1, append=-1))
+    place, velocity, seen_s, names = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64)
+    number, seen = 0, np.empty(0, dtype=np.int64)
+    for begin, end in pairwise(bounds.tolist()):
+        now_s, here = entries.time_s[begin], np.stack([entries.x_m[begin:end], entries.y_m[begin:end]], axis=1)
+        alive = now_s - seen_s <= gap_s
+        place, velocity, seen_s, names, seen = (a[alive] for a in (place, velocity, seen_s, names, seen))
+        since_s = now_s - seen_s
+        of = np.full(end - begin, -1)
+        if len(names):
+            away_m = np.hypot(*(here[:, None] - (place + velocity * since_s[:, None])[None]).transpose(2, 0, 1))
+            mine, theirs = away_m.argmin(axis=1), away_m.argmin(axis=0)
+            one = np.arange(end - begin)
+            both = (theirs[mine] == one) & (
+                away_m[one, mine] <= 2.5 + np.where(seen[mine] > 1, 5.0, 35.0) * since_s[mine]
+            )
+            of[both] = mine[both]
+        old, fresh = np.flatnonzero(of >= 0), np.flatnonzero(of < 0)
+        if len(old):
+            k = of[old]
+            left, second = here[old] - (place[k] + velocity[k] * since_s[k, None]), (seen[k] == 1)[:, None]
+            gain = np.clip(1 - np.exp(-since_s[k, None] / _SETTLED_S), 0.3, 0.7)
+            velocity[k] += np.where(second, 1.0, gain**2 / (2 - gain)) * left / np.maximum(since_s[k, None], 1e-3)
+            place[k] = np.where(second, here[old], here[old] - (1 - gain) * left)
+            seen_s[k] = now_s
+            seen[k] += 1
+            track[begin + old] = names[k]
+        track[begin + fresh] = number + np.arange(len(fresh))
+        place, velocity = np.concatenate([place, here[fresh]]), np.concatenate([velocity, np.zeros((len(fresh), 2))])
+        seen_s, names = np.append(seen_s, np.full(len(fresh), now_s)), np.append(names, track[begin + fresh])
+        number, seen = number + len(fresh), np.append(seen, np.ones(len(fresh), dtype=np.int64))
+    return track
