@@ -20,6 +20,7 @@ import pandas as pd
 
 import bench_fusion
 import bench_long
+import bench_memory
 import bench_read
 import bench_viewer
 from copem_replay.core.tracks import TRUTH, Tracks
@@ -277,7 +278,12 @@ def _plain_loop(path: Path) -> int:
     return len(pd.DataFrame(rows))
 
 
-BENCHES = (visibility, paper, reading, writing, commands, reports, fusion, peers, crowd, long)
+def memory() -> Iterator[dict[str, object]]:
+    """Numbers that last, and the crossing with all memory on."""
+    yield from bench_memory.memory(*_loaded(ROOT / "logs/crossing.yaml"))
+
+
+BENCHES = (visibility, memory, paper, reading, writing, commands, reports, fusion, peers, crowd, long)
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -11,7 +11,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.text import printable
 
 app = typer.Typer(
-    help="Convert a data set or a simulation to a recording of OSI truth (MCAP).", rich_markup_mode=None
+    help="Convert a data set or a simulation to a recording.\n\nOf OSI truth, as MCAP.", rich_markup_mode=None
 )  # fmt: skip
 
 Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of the format.")]

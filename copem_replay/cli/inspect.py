@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from copem_replay.cli.options import Ego, ExperimentFile, FromS, LogFile, LogFiles, Logs, ToS
-from copem_replay.cli.terminal import complain, note, say, say_blocks
+from copem_replay.cli.terminal import complain, note, say, say_blocks, width_of
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,9 +24,10 @@ def info(
     logs: LogFiles,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON: one array, an entry per recording.")] = False,
 ) -> int:
-    """Describe recordings: topics, object lists, objects, span, rate, ego vehicle, what is missing.
+    """Describe recordings: what is in them, what is missing.
 
-    The exit code is 0 when at least one object list is readable, else 2.
+    Topics, object lists, objects, span, rate, ego vehicle. The exit code is 0 when at least one object list is
+    readable, else 2.
     """
     from copem_replay.experiment.draft.findings import as_json as plain
     from copem_replay.experiment.draft.survey import survey
@@ -35,16 +37,17 @@ def info(
     if as_json:
         print(json.dumps([plain(s) for s in surveys], indent=1, ensure_ascii=False))
     else:
-        say_blocks(describe(s) for s in surveys if s.topics)
+        say_blocks(describe(s, width_of(sys.stdout)) for s in surveys if s.topics)
     complain(s.reason for s in surveys if s.reason is not None)
     return 0 if any(s.readable for s in surveys) else 2
 
 
 def init(log: LogFile) -> int:
-    """Print an experiment that replays a recording, with comments: copem-replay init LOG > experiment.yaml.
+    """Print an experiment that replays a recording, with comments.
 
-    Its paths are relative to the working folder. For lists of an unknown schema, `read:` is proposed from the names of
-    their fields. The exit code is 2 when no list of true objects is readable.
+    copem-replay init LOG > experiment.yaml. Its paths are relative to the working folder. For lists of an unknown
+    schema, `read:` is proposed from the names of their fields. The exit code is 2 when no list of true objects is
+    readable.
     """
     from copem_replay.cli.api.recordings import draft_of, encodable
     from copem_replay.experiment.draft.template import unfinished
@@ -65,7 +68,10 @@ def check(
     from_s: FromS = None,
     to_s: ToS = None,
 ) -> int:
-    """Report every problem of an experiment file at once, with file and line, against its recordings too."""
+    """Report every problem of an experiment, with file and line.
+
+    All at once, and against its recordings, too.
+    """
     from copem_replay.cli.api.study import prepared, read_study
 
     study = read_study(source_with(experiment, {"ego": ego}, log or (), (from_s, to_s)))
@@ -78,7 +84,10 @@ def check(
 
 
 def schema() -> int:
-    """Print the JSON Schema of the experiment file, with all installed components."""
+    """Print the JSON Schema of the experiment file.
+
+    With all components that are installed.
+    """
     from copem_replay.experiment.schema import Experiment
 
     described = Experiment.model_json_schema(by_alias=True) | {
@@ -97,7 +106,7 @@ def source_with(
     """The experiment file, with the options that are given in the place of its keys."""
     from dataclasses import replace
 
-    from copem_replay.experiment.file import load
+    from copem_replay.experiment.file import load, with_logs, without_settings
 
     source = load(path)
     given = {name: value for name, value in changes.items() if value is not None}
@@ -108,6 +117,6 @@ def source_with(
         window = written if isinstance(written, list) and len(written) == len(window_s) else [None, None]
         given["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
         options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
-    if logs:
-        given["logs"] = [str(log) for log in logs]
-    return replace(source, data=source.data | given, options=options, logs=tuple(map(str, logs)))
+    data = without_settings(source.data, [key for key in ("ego", "window_s") if key in given])
+    source = replace(source, data=data | given, options=options)
+    return with_logs(source, [str(log) for log in logs]) if logs else source

@@ -15,7 +15,7 @@ try:  # before `main` is there to catch it
     import signal
     import traceback
     from contextlib import suppress
-    from typing import Annotated
+    from typing import Annotated, Any
 
     import typer
 
@@ -61,6 +61,7 @@ for command in (
     results.plot,
     results.report,
     results.view,
+    results.layout,
     inspect.schema,
 ):
     app.command()(command)
@@ -121,12 +122,22 @@ def _ended() -> int:
 def _called(arguments: list[str]) -> int:
     """Run a command. Not by typer's own `main`, which has other ideas of what errors and interrupts look like."""
     command = typer.main.get_command(app)
+    _say_types_in_words(command)
     try:
         with command.make_context("copem-replay", arguments) as context:
             code = command.invoke(context)
     except typer.Exit as ended:
         return ended.exit_code
     return code if isinstance(code, int) else 0
+
+
+def _say_types_in_words(command: Any) -> None:
+    """Arguments in `--help` without `<path>` and `list[Path]` beside their names, which say it in words."""
+    for under in getattr(command, "commands", {}).values():
+        _say_types_in_words(under)
+    for parameter in command.params:
+        if parameter.param_type_name == "argument" and hasattr(parameter, "display_type_rich"):
+            parameter.display_type_rich = lambda ctx: None
 
 
 def _discard_output() -> None:

@@ -8,29 +8,28 @@ from typing import Annotated, TypeAlias
 import typer
 
 ExperimentFile: TypeAlias = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (YAML).")]
-ResultsFolder: TypeAlias = Annotated[Path, typer.Argument(metavar="DIR", help="Results folder.")]
+ResultsFolder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder.")]
 LogFile: TypeAlias = Annotated[
     Path, typer.Argument(metavar="LOG", help="Recording: MCAP file, rosbag2 folder, .osi file.")
 ]
 LogFiles: TypeAlias = Annotated[
-    list[Path], typer.Argument(metavar="LOG...", help="Recordings: MCAP files, rosbag2 folders, .osi files.")
+    list[Path], typer.Argument(metavar="LOG", help="Recordings: MCAP files, rosbag2 folders, .osi files.")
 ]
 Logs: TypeAlias = Annotated[
-    list[Path] | None, typer.Option("--log", help="Use this recording instead of those in the experiment.")
+    list[Path] | None,
+    typer.Option("--log", metavar="FILE", help="Use this recording instead of those in the experiment."),
 ]
 Ego: TypeAlias = Annotated[str | None, typer.Option("--ego", metavar="ID", help="Id of the ego vehicle.")]
 FromS: TypeAlias = Annotated[
     float | None,
-    typer.Option("--from", metavar="S", help="Start of the window that is read, in seconds since the log starts [0]."),
+    typer.Option("--from", metavar="SECONDS", help="Start of the window that is read, since the log starts [0]."),
 ]
 ToS: TypeAlias = Annotated[
     float | None,
-    typer.Option(
-        "--to", metavar="S", help="End of the window that is read, in seconds since the log starts [its end]."
-    ),
+    typer.Option("--to", metavar="SECONDS", help="End of the window that is read, since the log starts [its end]."),
 ]
 Baseline: TypeAlias = Annotated[
-    str | None, typer.Option("--baseline", metavar="C", help="Configuration to compare with [the one named ideal].")
+    str | None, typer.Option("--baseline", metavar="NAME", help="Configuration to compare with [the one named ideal].")
 ]
 
 

@@ -1,19 +1,21 @@
-"""Commands on results folders: compare, plot, report, view."""
+"""Commands on results folders: compare, plot, report, view, layout."""
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from copem_replay.cli.options import Baseline, ResultsFolder, listed
-from copem_replay.cli.terminal import note, say, say_blocks, tidied
+from copem_replay.cli.terminal import note, say, say_blocks, tidied, width_of
 from copem_replay.core.errors import InputError
 
 
 def compare(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Results folders.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, one or several.")],
     configurations: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
     ] = None,
@@ -23,7 +25,7 @@ def compare(
     ] = None,
     false_positives_per_min: Annotated[
         float | None,
-        typer.Option(metavar="X", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
+        typer.Option(metavar="N", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
     ] = None,
     rrd: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write one run of all of them as a Rerun recording (.rrd).")
@@ -33,7 +35,10 @@ def compare(
     ] = None,
     log: Annotated[str | None, typer.Option(metavar="NAME", help="Log in that recording [likewise].")] = None,
 ) -> int:
-    """Compare configurations with a baseline, paired by log, object and run, within or across results folders."""
+    """Compare configurations with a baseline, with intervals.
+
+    They are paired by log, object and run, within a results folder or across several.
+    """
     from copem_replay.cli.api.results import compare as compared
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
 
@@ -53,7 +58,7 @@ def compare(
     if rrd is not None:
         notes += write_beside(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     note(notes)
-    say_blocks([comparison_text(comparison).splitlines()])
+    say_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
     if out is not None:
         write_comparison(comparison, out)
     for file in (out, rrd):
@@ -65,7 +70,7 @@ def compare(
 
 def plot(
     folder: ResultsFolder,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [DIR/figures].")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [FOLDER/figures].")] = None,
     configurations: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Only these [all; of single runs four of them].")
     ] = None,
@@ -77,7 +82,10 @@ def plot(
         str | None, typer.Option(metavar="NAME", help="Log in the figure of single runs [the first].")
     ] = None,
 ) -> int:
-    """Draw the figures of a results folder as PNG and SVG: single runs, distances, detection curves, sweeps."""
+    """Draw the figures of a results folder, as PNG and SVG.
+
+    Single runs, distances at detection, detection curves, where the time goes, sweeps.
+    """
     from copem_replay.cli.api.plot import write_figures
 
     names = listed(configurations)
@@ -92,10 +100,13 @@ def plot(
 
 def report(
     folder: ResultsFolder,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [DIR/report.html].")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the file [FOLDER/report.html].")] = None,
     baseline: Baseline = None,
 ) -> int:
-    """Write the report of a results folder as one HTML file that opens offline: words, tables, figures, provenance."""
+    """Write the report of a results folder, as one HTML file.
+
+    Words, tables, figures and provenance; it opens offline.
+    """
     from copem_replay.cli.api.results import write_report
 
     path = write_report(folder, out, baseline=baseline)
@@ -104,9 +115,42 @@ def report(
     return 0
 
 
-def view(folder: ResultsFolder) -> int:
-    """Open the recordings of a results folder in the Rerun viewer."""
+def layout(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder, or a replay.mcap.")],
+    configurations: Annotated[
+        str | None, typer.Option("--compare", metavar="A,B,…", help="These over each other, and each alone.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The layout [beside the replay, as .foxglove.json].")
+    ] = None,
+) -> int:
+    """Write a layout of a replay, for Foxglove and Lichtblick.
+
+    The configurations side by side over the truth, cameras in step; under them when each knows an object.
+    """
+    from copem_replay.core.files import atomic_file
+    from copem_replay.io.write.foxglove_layout import layout_of
+
+    replay = folder / "replay.mcap" if folder.is_dir() else folder
+    made = layout_of(replay, listed(configurations) or ())
+    path = out or replay.with_suffix(".foxglove.json")
+    with atomic_file(path) as scratch:
+        scratch.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    say(f"layout in {path}")
+    return 0
+
+
+def view(
+    folder: ResultsFolder,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve viewer and recordings on 127.0.0.1, for a browser, until interrupted.")
+    ] = False,
+) -> int:
+    """Open the recordings of a results folder in the viewer.
+
+    Each opens half a second before the first onset.
+    """
     from copem_replay.cli.api.results import view as opened
 
-    opened(folder)
+    opened(folder, web=web)
     return 0

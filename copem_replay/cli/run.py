@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +11,8 @@ import typer
 
 from copem_replay.cli.inspect import source_with
 from copem_replay.cli.options import Ego, ExperimentFile, FromS, Logs, ToS
-from copem_replay.cli.terminal import note, say, with_progress
+from copem_replay.cli.progress import with_progress
+from copem_replay.cli.terminal import note, say, width_of
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,10 +25,12 @@ def run(
     ego: Ego = None,
     from_s: FromS = None,
     to_s: ToS = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Results folder [out/<experiment>].")] = None,
-    runs: Annotated[int | None, typer.Option(min=1, help="Number of runs.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, max=1024, help="Number of workers [one per core].")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Results folder [out/<experiment>].")] = None,
+    runs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Number of runs.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=1024, help="Number of workers [one per core].")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in the folder.")] = False,
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Leave out recordings that cannot be replayed.")
@@ -34,7 +39,7 @@ def run(
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
-    """Replay an experiment, measure, write the results folder, and print the summary."""
+    """Replay an experiment, write its results, print the summary."""
     from copem_replay.cli.api.study import prepared, read_study
     from copem_replay.results.place import check_inputs, taken
 
@@ -47,14 +52,15 @@ def run(
         url = _viewer(study.experiment, viewer) if live or viewer is not None else None
         from copem_replay.cli.api.run import fill, replayed
         from copem_replay.metrics.summary_text import summary_text
+        from copem_replay.viewer.opening import recordings_of
 
         ready, warnings = prepared(study)
         note(warnings)
-        result = with_progress(lambda progress: replayed(study, ready, jobs, progress))
+        result = with_progress("replaying", lambda progress: replayed(study, ready, jobs, progress))
         notes = fill(place, result, skipped=study.skipped, viewer=url)
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
         note([*place.notes, *skipped, *notes, *result.replayed.costs])
-        print(summary_text(result.summary))
+        print(summary_text(result.summary, width_of(sys.stdout)))
         if result.sweep is not None:
             say(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
         say(f"results in {place.shown}")
@@ -62,6 +68,7 @@ def run(
             from copem_replay.cli.api.results import write_report
 
             say(f"report in {write_report(place.shown)}")
+    say(f"next: copem-replay {'view' if recordings_of(place.shown) else 'report'} {shlex.quote(str(place.shown))}")
     return 1 if study.skipped else 0
 
 

@@ -1,15 +1,15 @@
-"""The terminal: lines that nothing in a name can break, notes and problems on stderr, a bar while it takes long."""
+"""The terminal: lines that fit it and that nothing in a name can break, notes and problems on stderr."""
 
 from __future__ import annotations
 
+import shutil
 import sys
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TextIO
 
-T = TypeVar("T")
-Progress = Callable[[int, int], None]
+from copem_replay.core.text import wrapped
 
 
 def printable(text: str) -> str:
@@ -18,20 +18,31 @@ def printable(text: str) -> str:
     return "".join(c.encode("unicode_escape").decode() if c in harmful else c for c in text)
 
 
+def width_of(stream: TextIO | None) -> int | None:
+    """How many characters a line may have; None where it is no terminal: files and pipes get lines whole."""
+    return shutil.get_terminal_size().columns if stream is not None and stream.isatty() else None
+
+
 def say(line: str) -> None:
     """Print a line of the answer."""
-    print(printable(line))
+    say_blocks([[line]])
 
 
 def say_blocks(blocks: Iterable[Sequence[str]]) -> None:
     """Print blocks of lines, an empty line between them."""
-    print("\n\n".join("\n".join(map(printable, block)) for block in blocks))
+    width = width_of(sys.stdout)
+    print("\n\n".join("\n".join(_fitted(line, width) for line in block) for block in blocks))
 
 
 def complain(lines: Iterable[str]) -> None:
     """Print problems on stderr."""
+    width = width_of(sys.stderr)
     for line in lines:
-        print(printable(line), file=sys.stderr)
+        print(_fitted(line, width), file=sys.stderr)
+
+
+def _fitted(line: str, width: int | None) -> str:
+    return "\n".join(wrapped(printable(line), width))
 
 
 def note(lines: Iterable[str]) -> None:
@@ -44,15 +55,3 @@ def tidied(path: Path, place: Path | None = None) -> None:
     from copem_replay.core.scratch import remove_leftovers
 
     note(remove_leftovers(path, place))
-
-
-def with_progress(work: Callable[[Progress | None], T]) -> T:
-    """Show a bar on a terminal, nothing otherwise."""
-    if sys.stderr is None or not sys.stderr.isatty():
-        return work(None)
-    from rich.console import Console
-    from rich.progress import Progress as Bar
-
-    with Bar(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("replaying", total=None)
-        return work(lambda done, total: bar.update(task, completed=done, total=total))

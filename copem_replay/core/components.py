@@ -82,6 +82,8 @@ Number = Annotated[float, Field(strict=True, ge=-_LARGEST, le=_LARGEST)]
 """A number; text and true/false are refused."""
 Positive = Annotated[float, Field(strict=True, gt=0, le=_LARGEST)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, le=_LARGEST)]
+Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
+"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Count = Annotated[int, Field(strict=True, ge=1, le=10**9)]
 Flag = Annotated[bool, Field(strict=True)]

@@ -121,39 +121,50 @@ def held_rows(
     for c in range(1, len(cell_of)):
         same = cell_key[c - 1] == cell_key[c] and cell_word[c - 1] == cell_word[c]
         follows[c] = same and cell_of[c - 1] == cell_of[c] - 1
+    off_ns = np.empty(len(stamp))  # since the cell began
+    for c in range(len(cell_of)):
+        for p in range(begin[c], begin[c + 1]):
+            off_ns[p] = np.float64(stamp[p] - begin_ns[c])
     for s in range(out.shape[0]):
         run, row = runs[s], out[s]
         known, carried, carried_ns = False, 0.0, 0  # of the cell before
         for c0 in range(0, len(cell_of), block):
             size = min(block, len(cell_of) - c0)
+            keys, words, starts = cell_key[c0 : c0 + size], cell_word[c0 : c0 + size], begin_ns[c0 : c0 + size]
             for i in range(_AT_ONCE):
-                at_i, value_i = at[i], value[i]  # loop by loop: each is compiled to vectors
+                at_i, value_i = at[i], value[i]  # loop by loop, from 0 on: each is compiled to vectors
                 for j in range(size):
-                    u, v = _two_uniforms(cell_key[c0 + j], cell_word[c0 + j], begin_ns[c0 + j] + i, run)
-                    at_i[j], value_i[j] = u, v
+                    u, v = _two_uniforms(keys[j], words[j], starts[j] + i, run)
+                    at_i[j] = u
+                    value_i[j] = v
                 for j in range(size):
                     at_i[j] = -tau_ns * _log(at_i[j])
-                for j in range(size if i else 0):
-                    at_i[j] += at[i - 1, j]
+                if i:
+                    sum_before = at[i - 1]
+                    for j in range(size):
+                        at_i[j] += sum_before[j]
             for j in range(size):
                 c = c0 + j
                 k, w, start = cell_key[c], cell_word[c], begin_ns[c]
                 known = known and follows[c]
                 a0, a1, a2, a3 = at[0, j], at[1, j], at[2, j], at[3, j]
                 v0, v1, v2, v3 = value[0, j], value[1, j], value[2, j], value[3, j]
-                if not known and np.float64(stamp[begin[c]] - start) < a0:
+                if not known and off_ns[begin[c]] < a0:
                     carried_ns, carried = _last_of(k, w, run, cell_of[c] - 1, tau_ns, shift)
                     known = True
-                for p in range(begin[c], begin[c + 1]):
-                    off = np.float64(stamp[p] - start)
-                    # Chosen without a branch: which way it goes could not be foreseen.
-                    found = v0 if a0 <= off else carried
-                    found = v1 if a1 <= off else found
-                    found = v2 if a2 <= off else found
-                    row[p] = v3 if a3 <= off else found
+                if a2 > last:  # mostly; chosen without a branch: which way it goes could not be foreseen
+                    for p in range(begin[c], begin[c + 1]):
+                        found = v0 if a0 <= off_ns[p] else carried
+                        row[p] = v1 if a1 <= off_ns[p] else found
+                else:
+                    for p in range(begin[c], begin[c + 1]):
+                        found = v0 if a0 <= off_ns[p] else carried
+                        found = v1 if a1 <= off_ns[p] else found
+                        found = v2 if a2 <= off_ns[p] else found
+                        row[p] = v3 if a3 <= off_ns[p] else found
                 if stamps_too or a3 <= last:
                     for p in range(begin[c], begin[c + 1]):
-                        off = np.float64(stamp[p] - start)
+                        off = off_ns[p]
                         count = int(a0 <= off) + int(a1 <= off) + int(a2 <= off) + int(a3 <= off)
                         if count == _AT_ONCE:
                             more, row[p] = _beyond(k, w, run, start, count - 1, a3, tau_ns, off)

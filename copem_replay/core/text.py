@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import difflib
+import textwrap
 from collections.abc import Iterable
 
 
 def printable(text: str) -> str:
     """On one line, and without what a terminal would act on: names in a recording may hold anything."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def wrapped(line: str, width: int | None) -> list[str]:
+    """A line in as many as it takes to fit, broken at spaces, the further ones indented; None: as it is.
+
+    What has no spaces stays whole, so that paths and addresses can be copied.
+    """
+    if width is None or len(line) <= width:
+        return [line]
+    indent = " " * (len(line) - len(line.lstrip()))
+    further = f"{indent}    "
+    return textwrap.wrap(
+        line, max(width, len(further) + 1), subsequent_indent=further,
+        break_long_words=False, break_on_hyphens=False, drop_whitespace=True,
+    )  # fmt: skip
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:

@@ -45,6 +45,7 @@ def references(source: Source) -> Iterator[str]:
     yield from _braking(source, data)
     yield from _carried(source, data)
     yield from _sweep(source, data, units)
+    yield from _settings(source, data, units, pems)
     show, runs = data.get("show"), data.get("runs", 1)
     configurations = _names(data.get("configurations"))
     chosen = show.get("configurations") if isinstance(show, dict) else None
@@ -152,6 +153,32 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             yield source.at(
                 ("sweep", "units", k), f"expected at most {others}, the units beside the ego's; found {count}"
             )
+
+
+def _settings(source: Source, data: dict[str, Any], units: Sequence[str], pems: Sequence[str]) -> Iterator[str]:
+    """What the settings of single logs name and is not there, and what they set that is swept."""
+    logs, measure, swept = data.get("logs"), data.get("measure"), data.get("sweep")
+    everywhere = measure.get("distance_to", "ego") if isinstance(measure, dict) else "ego"
+    for k, entry in enumerate(logs if isinstance(logs, list) else []):
+        if not isinstance(entry, dict):
+            continue
+        mine, own = entry.get("units"), entry.get("measure")
+        for name, unit in mine.items() if isinstance(mine, dict) else ():
+            key: Key = ("logs", k, "units", name)
+            if _is_name(name) and str(name) not in units:
+                yield source.at(key, unknown("unit", name, units))
+            pem = unit.get("pem") if isinstance(unit, dict) else None
+            if _is_name(pem) and str(pem) not in pems:
+                yield source.at((*key, "pem"), unknown("PEM", pem, pems))
+            for what, of in (("rate_hz", "rate_hz"), ("on", "penetration_rate")):
+                if isinstance(unit, dict) and what in unit and isinstance(swept, dict) and swept.get(of):
+                    yield source.at((*key, what), f"{of} is swept, in all logs alike; leave it out here")
+        place = own.get("distance_to", everywhere) if isinstance(own, dict) else everywhere
+        if place not in ("ego", everywhere) and _is_name(place) and str(place) not in units:
+            yield source.at(("logs", k, "measure", "distance_to"), unknown("unit", place, ["ego", *units]))
+        elif isinstance(mine, dict) and place in mine and mine[place] is None:
+            message = f"the log lacks unit {place!r}, from which distances are measured; give the log its own"
+            yield source.at(("logs", k, "units", str(place)), message + " `measure: {distance_to: …}`")
 
 
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:

@@ -8,16 +8,27 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from copem_replay.communication.link import ConstantLink, LinkModel
-from copem_replay.core.components import Count, Frozen, Id, NotNegative, Positive, Share, Slot, at_key, described
+from copem_replay.core.components import Count, Frozen, Id, Latency, Positive, Slot, at_key, described
+from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
-from copem_replay.io.config import EgoTopic, Latency, Read, ReadFields, Recorded
+from copem_replay.io.config import Ego, HowRead, Read, Recorded, WindowOf
 from copem_replay.metrics.config import Braking, Measure
-from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
-from copem_replay.perception.pem.ghosts import MeanNumber
+from copem_replay.perception.config import Carriers, Obstacle, Placement
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Surface, Visibility
 
@@ -123,105 +134,48 @@ class Configuration(Frozen):
         return self.link_model.fixed_s(unit)
 
 
-def _how_many(value: object) -> object:
-    if isinstance(value, str | list | tuple):
-        raise ValueError(f"expected how many units beside the ego's, such as 2 (a count, no names), found {value!r}")
-    return value
+MEASURED_PER_LOG = ("objects", "onset", "distance_to", "annotated")
+"""Keys of `measure` that a log may have its own of; the others say what the tables of all logs have in common."""
 
 
-Units = Annotated[int, Field(strict=True, ge=0, le=10**6), BeforeValidator(_how_many)]
+class LogSettings(Frozen):
+    """A recording, and what is otherwise for it: keys that are given replace those of the experiment, lists whole.
 
-
-def _once(values: tuple[float, ...]) -> tuple[float, ...]:
-    for k, value in enumerate(values):
-        if value in values[:k]:
-            raise ValueError(f"expected each value once, found {value:g} twice")
-    return values
-
-
-def _none_or_lasting(value: float) -> float:
-    if 0 < value < 0.001:
-        raise ValueError(f"expected 0 or at least 0.001 (s), found {value:g}")
-    return value
-
-
-Lasting = Annotated[float, Field(strict=True, ge=0, le=86_400), AfterValidator(_none_or_lasting)]
-"""A correlation time in seconds; 0: nothing lasts."""
-SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
-
-
-class SweptBy(Frozen):
-    """Which configurations each quantity changes, where not all change the same ones."""
-
-    latency_s: SweptNames | None = None
-    rate_hz: SweptNames | None = None
-    units: SweptNames | None = None
-    penetration_rate: SweptNames | None = None
-    correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
-    ghosts_in_list: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
-
-
-def _swept_by(value: object) -> str:
-    return "by" if isinstance(value, dict | SweptBy) else "names"
-
-
-Swept = Annotated[Annotated[SweptNames, Tag("names")] | Annotated[SweptBy, Tag("by")], Discriminator(_swept_by)]
-
-
-class Sweep(Frozen):
-    """Values of one quantity at a time at which `configurations` are run, too: names, or names by quantity.
-
-    By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
-    `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
-    `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
-    how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
-    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average.
+    `file`: as a plain entry, wildcards too. `name`: what the log is called, by default as its file. Of `units` and
+    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it.
     """
 
-    configurations: Swept | None = None
-    latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_once)] | None = None
-    rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
-    units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
-    penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
-    correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
-        default=None, exclude_if=lambda values: values is None
-    )
-    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
-        default=None, exclude_if=lambda values: values is None
-    )
+    file: Annotated[str, Field(min_length=1)]
+    name: Annotated[Id, Field(min_length=1)] | None = None
+    ego: Ego | None = None
+    window_s: WindowOf | None = None
+    units: dict[Id, dict[str, Any] | None] = Field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] | None = None
+    read: HowRead | None = None
+    measure: dict[str, Any] = Field(default_factory=dict)
 
-    @model_validator(mode="after")
-    def _some(self) -> Self:
-        names = list(SweptBy.model_fields)
-        if not any(getattr(self, name) for name in names):
-            known = f"{', '.join(names[:-1])} or {names[-1]}"
-            raise ValueError(f"expected values of {known}, such as `latency_s: [0, 0.5, 1]`")
-        for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
-            if self.chosen(quantity) and not getattr(self, quantity):
-                raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")
-        return self
+    @field_validator("measure")
+    @classmethod
+    def _of_a_log(cls, measure: dict[str, Any]) -> dict[str, Any]:
+        for key in measure:
+            if key not in MEASURED_PER_LOG:
+                names = ", ".join(MEASURED_PER_LOG)
+                raise ValueError(f"{key}: goes for all logs alike; a log has its own {names}")
+        return measure
 
-    def chosen(self, quantity: str) -> tuple[str, ...] | None:
-        """The configurations that a quantity shall change; None: nothing is said of it."""
-        if not isinstance(self.configurations, SweptBy):
-            return self.configurations
-        chosen: tuple[str, ...] | None = getattr(self.configurations, quantity)
-        return chosen
+    @model_serializer(mode="wrap")
+    def _as_given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Only keys that are given: a `null` would be one, too."""
+        written: dict[str, Any] = write(self)
+        return {key: value for key, value in written.items() if key in self.model_fields_set}
 
 
-def _how_read(value: object) -> str:
-    named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
-    return "fields" if named else "topic"
+def _what_log(value: object) -> str:
+    return "settings" if isinstance(value, dict | LogSettings) else "path"
 
 
-HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
-
-
-def _what_ego(value: object) -> str:
-    return "topic" if isinstance(value, dict | EgoTopic) else "id"
-
-
-Ego = Annotated[Annotated[Id, Tag("id")] | Annotated[EgoTopic, Tag("topic")], Discriminator(_what_ego)]
+LogEntry = Annotated[Annotated[str, Tag("path")] | Annotated[LogSettings, Tag("settings")], Discriminator(_what_log)]
+"""A path, with wildcards or not, or a mapping with settings."""
 
 
 WhichRun = Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst", "best"]
@@ -251,13 +205,6 @@ class Show(Frozen):
         return () if self.run is None else (self.run,)
 
 
-def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
-    from_s, to_s = window_s
-    if from_s is not None and to_s is not None and from_s > to_s:
-        raise ValueError(f"expected [from, to], found one that ends ({to_s:g} s) before it begins ({from_s:g} s)")
-    return window_s
-
-
 def _as_file(schema: dict[str, Any]) -> None:
     """A file has to name its logs; only an experiment that is made in Python may leave them out."""
     described(schema)
@@ -268,7 +215,8 @@ def _as_file(schema: dict[str, Any]) -> None:
 class Experiment(Frozen):
     """An experiment file.
 
-    `window_s`: what of each log is read, [from, to] in seconds since the first message of its truth was logged.
+    `logs`: paths, or mappings with what is otherwise for a log. `window_s`: what of each log is read, [from, to] in
+    seconds since the first message of its truth was logged.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed
@@ -278,10 +226,10 @@ class Experiment(Frozen):
     model_config = ConfigDict(json_schema_extra=_as_file)
 
     version: Annotated[Literal[1], BeforeValidator(_version)]
-    logs: Annotated[tuple[str, ...], Field(min_length=1)] = ()
+    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)] = ()
     read: HowRead = Read()
     ego: Ego | None = None
-    window_s: Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)] | None = None
+    window_s: WindowOf | None = None
     max_gap_s: Positive = 0.5
     runs: Count = 1
     seed: Annotated[int, Field(strict=True), AfterValidator(_of_64_bits)] = 0

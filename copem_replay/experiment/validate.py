@@ -12,8 +12,19 @@ from copem_replay.core.errors import EgoError, RecordingError
 from copem_replay.core.text import printable, unknown
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, references
-from copem_replay.experiment.file import Problem, Source, is_there, log_paths, named_paths, parse
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.drive import SettingsError, of_log, with_settings
+from copem_replay.experiment.file import (
+    Problem,
+    Source,
+    folder_of,
+    is_there,
+    log_paths,
+    matching,
+    named_paths,
+    parse,
+)
+from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.shape_problems import by_key
 from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of
 from copem_replay.io.recorded_units import recorded_unit
@@ -30,6 +41,15 @@ class Refused:
     reason: str
     key: Key | None = None
 
+    def within(self, entry: int | None, settings: LogSettings | None) -> Refused:
+        """The same, where an entry of `logs` says what the experiment asks: its key there."""
+        key = self.key
+        if settings is None or not key:
+            return self
+        asked = getattr(settings, str(key[0]), None) if key[0] in settings.model_fields_set else None
+        there = key[1] in asked if key[0] in ("units", "measure") and asked is not None else asked is not None
+        return replace(self, key=("logs", entry or 0, *key)) if there else self
+
     def said(self, source: Source | None) -> str:
         """The reason as a line: where it is, and what is wrong."""
         line = f"{self.path}: {self.reason}"
@@ -39,9 +59,22 @@ class Refused:
 def problems(source: Source) -> tuple[Experiment | None, list[str]]:
     """The experiment, or None where its shape is wrong, and all problems that show without a look at the logs."""
     experiment, found = parse(source)
+    if experiment is not None and (unfit := list(_unfit_settings(source, experiment))):
+        experiment, found = None, found + unfit
     found += references(source)
     found += log_paths(source)[1]
     return experiment, sorted(found, key=lambda problem: problem.line if isinstance(problem, Problem) else 0)
+
+
+def _unfit_settings(source: Source, experiment: Experiment) -> Iterator[str]:
+    """What is wrong with the settings of single logs, once the keys of the experiment are in their place."""
+    for k, entry in enumerate(experiment.logs):
+        if isinstance(entry, LogSettings):
+            try:
+                with_settings(experiment, entry)
+            except SettingsError as error:
+                for key, message in by_key(Experiment, error.error, error.data, error.key):
+                    yield source.at(("logs", k, *key), message)
 
 
 def place_of(path: Path) -> Path:
@@ -76,19 +109,53 @@ def read_logs(
     recordings: dict[str, Recording] = {}
     refused: list[Refused] = []
     names_of = _named(source) if source is not None and isinstance(paths, Mapping) else {}
+    mine = settings_by_place(experiment, source)
     for path, key in keys.items():
         if not is_there(path):
             refused.append(Refused(path, "no such file", key))
         elif (place := os.path.realpath(path)) not in recordings:
-            recording, wrong = _read(experiment, path)
-            refused += wrong
+            entry, settings = mine.get(place, (None, None))
+            recording, wrong = _read(experiment if settings is None else with_settings(experiment, settings), path)
+            refused += [log.within(entry, settings) for log in wrong]
             if recording is not None and not wrong:
                 again = names_of.get(place, [])
                 said = [f"named more than once ({', '.join(again)}): replayed once"] if len(again) > 1 else []
                 recordings[place] = replace(recording, notes=(*said, *recording.notes))
     # Named when it is known which there are: the experiment that is written with the results names only these.
-    names = log_names([recording.path for recording in recordings.values()])
-    return [replace(r, scene=replace(r.scene, log=n)) for r, n in zip(recordings.values(), names, strict=True)], refused
+    given = {place: settings.name for place, (_, settings) in mine.items() if settings.name is not None}
+    return _with_names(recordings, given), refused
+
+
+def _with_names(recordings: Mapping[str, Recording], given: Mapping[str, str]) -> list[Recording]:
+    """The recordings, by where they lie, as logs of their own names, or of those that are `given`."""
+    unnamed = {place: recording for place, recording in recordings.items() if place not in given}
+    names = dict(given)
+    names |= zip(unnamed, log_names([recording.path for recording in unnamed.values()]), strict=True)
+    return [replace(r, scene=replace(r.scene, log=names[place])) for place, r in recordings.items()]
+
+
+def settings_by_place(experiment: Experiment, source: Source | None) -> dict[str, tuple[int, LogSettings]]:
+    """The entries of `logs` that are mappings, and their numbers, by where the recordings lie."""
+    folder = Path() if source is None else folder_of(source)
+    return {
+        os.path.realpath(path): (k, entry)
+        for k, entry in enumerate(experiment.logs)
+        if isinstance(entry, LogSettings)
+        for path in matching(entry.file, folder)
+    }
+
+
+def bound(experiment: Experiment, recordings: Sequence[Recording], source: Source | None) -> Experiment:
+    """The experiment whose entries of `logs` are these recordings, under their names, where any log has settings."""
+    mine = settings_by_place(experiment, source)
+    if not mine:
+        return experiment
+    logs = []
+    for recording in recordings:
+        _, settings = mine.get(os.path.realpath(recording.path), (0, LogSettings(file=".")))
+        named = {"file": str(recording.path), "name": recording.scene.log}
+        logs.append(settings.model_copy(update=named))
+    return experiment.model_copy(update={"logs": tuple(logs)})
 
 
 def _named(source: Source) -> dict[str, list[str]]:
@@ -179,8 +246,23 @@ def across_logs(experiment: Experiment, recordings: Sequence[Recording], source:
         return source.at(key, message) if source else message
 
     scenes = [recording.scene for recording in recordings]
+    for place, (entry, settings) in settings_by_place(experiment, source).items():
+        for scene in (r.scene for r in recordings if os.path.realpath(r.path) == place):
+            if [one.log for one in scenes].count(scene.log) > 1:
+                yield at(
+                    ("logs", entry, "name"), f"expected a name of its own, found {scene.log!r} of another log, too"
+                )
+            for n, wanted in enumerate(with_settings(experiment, settings).measure.objects.ids or ()):
+                if "objects" in settings.measure and wanted not in scene.object_number:
+                    of_id: Key = ("logs", entry, "measure", "objects", "ids", n)
+                    yield at(of_id, f"no object {wanted!r} in the log; there are {moving_ids(scene)}")
+    everywhere = bound(experiment, recordings, source)
+    kept = [of_log(everywhere, scene.log).configurations for scene in scenes]
+    for name in experiment.configurations if scenes else ():
+        if not any(name in configurations for configurations in kept):
+            yield at(("configurations", name), "no log has any of its units")
     for k, wanted in enumerate(experiment.measure.objects.ids or () if scenes else ()):
-        key = ("measure", "objects", "ids", k)
+        key: Key = ("measure", "objects", "ids", k)
         there = [scene for scene in scenes if wanted in scene.object_number]
         if not there:
             yield at(key, f"no object {wanted!r} in any log; the first has {moving_ids(scenes[0])}")

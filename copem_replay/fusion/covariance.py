@@ -53,7 +53,7 @@ _TIE = 1e-12
 @nb.njit(cache=True, nogil=True)
 def inverse_variance(x: Float, cov: Float) -> tuple[Float, Float]:
     """Mean (d,) and covariance (d, d) of the summed information: optimal if and only if the errors are independent."""
-    information = _information(cov)
+    information = inverses(cov)
     return _combined(x, cov, information, np.ones(len(x)))
 
 
@@ -68,7 +68,7 @@ def covariance_intersection(x: Float, cov: Float, by_determinant: bool) -> tuple
     Source: S. Julier, J. Uhlmann, "A non-divergent estimation algorithm in the presence of unknown correlations",
     American Control Conference 1997. All inputs at once, not pair after pair, which would depend on their order.
     """
-    information = _information(cov)
+    information = inverses(cov)
     weight = _best_weights(information, by_determinant)
     mean, covariance = _combined(x, cov, information, weight)
     return mean, covariance, weight
@@ -84,7 +84,7 @@ def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple
     Source: D. Fränken, A. Hüpper, "Improved fast covariance intersection for distributed data fusion", FUSION 2005.
     """
     n, d = x.shape
-    information = _information(cov)
+    information = inverses(cov)
     total = np.zeros((d, d))
     for k in range(n):
         total += information[k]
@@ -131,7 +131,7 @@ def _combined(x: Float, cov: Float, information: Float, weight: Float) -> tuple[
                 total[i, j] += part
                 # Relative to the first: information of 1e9 times kilometres would leave no digits for millimetres.
                 moment[i] += part * (x[k, j] - x[0, j])
-    _invert(total, covariance)
+    invert(total, covariance)
     for i in range(d):
         mean[i] = 0.0
         for j in range(d):
@@ -242,8 +242,8 @@ def _share(info: Float, weight: Float, among: Bool) -> None:
                 if above[p]:
                     for f in range(e + 1):
                         curvature[e, f] += entries[p, e] * entries[p, f]
-        _invert_root(curvature, root)
-        multiplier += _solve(root, left)
+        invert_root(curvature, root)
+        multiplier += solve(root, left)
         settled += 1
         for p in range(c):
             total = 0.0
@@ -269,7 +269,7 @@ def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
             for i in range(d):
                 for j in range(d):
                     total[i, j] += weight[k] * info[k, i, j]
-    _invert_root(total, factor)
+    invert_root(total, factor)
     for k in range(n):
         for i in range(d):
             for j in range(d):
@@ -309,8 +309,8 @@ def _newton(lever: Float, score: Float, has: Bool, times: float) -> Float:
                     total += lever[chosen[p], i, j] * lever[chosen[q], i, j]
             curvature[p, q] = times * total
         curvature[p, p] += _RIDGE
-    _invert_root(curvature, root)
-    gain, one = _solve(root, score[chosen] - 1), _solve(root, np.ones(c))
+    invert_root(curvature, root)
+    gain, one = solve(root, score[chosen] - 1), solve(root, np.ones(c))
     shift = gain.sum() / one.sum()  # so that the changes sum to 0
     change = np.zeros(len(has))
     for p in range(c):
@@ -344,7 +344,7 @@ def _slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
         for j in range(d):
             J[i, j] = step * along[i, j]
         J[i, i] += 1.0
-    _invert(J, inverse)
+    invert(J, inverse)
     total = 0.0
     if by_determinant:
         for i in range(d):
@@ -366,16 +366,16 @@ def _slope(step: float, along: Float, B: Float, by_determinant: bool) -> float:
 
 
 @nb.njit(cache=True, nogil=True)
-def _information(cov: Float) -> Float:
+def inverses(cov: Float) -> Float:
     """Inverses (n, d, d)."""
     information = np.empty(cov.shape)
     for k in range(len(cov)):
-        _invert(cov[k], information[k])
+        invert(cov[k], information[k])
     return information
 
 
 @nb.njit(cache=True, nogil=True)
-def _invert(matrix: Float, out: Float) -> None:
+def invert(matrix: Float, out: Float) -> None:
     """The inverse, exactly symmetric."""
     d = len(matrix)
     if d == 2:
@@ -385,7 +385,7 @@ def _invert(matrix: Float, out: Float) -> None:
         out[0, 1] = out[1, 0] = -b * over
         return
     root = np.empty((d, d))
-    _invert_root(matrix, root)
+    invert_root(matrix, root)
     for i in range(d):
         for j in range(i + 1):
             total = 0.0
@@ -395,7 +395,7 @@ def _invert(matrix: Float, out: Float) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _invert_root(matrix: Float, out: Float) -> None:
+def invert_root(matrix: Float, out: Float) -> None:
     """L⁻¹ where LLᵀ is the matrix, of which only the lower triangle is read (Cholesky)."""
     d = len(matrix)
     for i in range(d):
@@ -415,7 +415,7 @@ def _invert_root(matrix: Float, out: Float) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def _solve(root: Float, right: Float) -> Float:
+def solve(root: Float, right: Float) -> Float:
     """What the matrix takes to `right`, given its L⁻¹."""
     solution = np.zeros(len(right))
     for i in range(len(right)):

@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from copem_replay.core.agree import AGREE
-from copem_replay.core.components import Share
+from copem_replay.core.components import NotNegative, Share
 from copem_replay.core.object_list import ENTRY, Entries, Inputs, ObjectLists
 from copem_replay.core.tracks import Float
 from copem_replay.fusion.base import ListFusion
-from copem_replay.fusion.gnn_kernel import fuse_run, intersect
+from copem_replay.fusion.combine_kernel import CROSS, INVERSE, SPLIT_BY_SHARE, SPLIT_BY_VARIANCE, combine_members
+from copem_replay.fusion.conflict_kernel import unite
+from copem_replay.fusion.gnn_kernel import Clusters, fuse_run, intersect
 from copem_replay.fusion.union import run_after_run
+
+Gate = Annotated[float, Field(strict=True, gt=0, lt=1)]
+
+_KEYS_OF: dict[str, dict[str, float]] = {
+    "split_covariance_intersection": {"dependent_share": 0.5, "dependent_m2": 0.0},
+    "cross_covariance": {"correlation": 0.5},
+    "covariance_union": {"conflict_gate": 0.99},  # as wide as `gate`
+}
+"""Keys that only one way to combine has, and what they are by default (`dependent_m2` stands instead of the share)."""
+
+
+def _absent(value: object) -> bool:
+    return value is None
 
 
 class Gnn(ListFusion):
@@ -24,40 +39,99 @@ class Gnn(ListFusion):
     ln|S|, S = P_cluster + P_entry, where d² = νᵀS⁻¹ν is within `gate` (the share of true pairs inside: χ², two degrees
     of freedom) and the classes agree; whoever is left founds a cluster. No unit is twice in one. The members' positions
     are combined by `combine`: inverse variance (independent errors) or covariance intersection (any correlation; of
-    least trace or, `minimise`, determinant), in closed form if fast, which gives the best member where that is better.
+    least trace or, `minimise`, determinant), in closed form if fast, which gives the best member where that is better;
+    inverse covariance intersection (common information, counted once); split covariance intersection (a part of each
+    stated covariance, `dependent_share`, or `dependent_m2` per axis, hangs together in whatever way, the rest is
+    independent); cross covariance (every two errors are correlated by `correlation`); covariance union (inverse
+    variance, but clusters whose classes agree and whose boxes overlap, no list having both, are one object in conflict:
+    what lies beyond `conflict_gate` of the others is united with them, so that whichever is right is covered).
     Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height, velocity, size and yaw (on the circle) the
     mean by inverse trace of the position covariance. Source: S. Blackman, R. Popoli, "Design and Analysis of Modern
-    Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py, and for the running state by which
-    intersecting clusters are compared W. Niehsen, "Information fusion based on fast covariance intersection filtering",
-    FUSION 2002. Assumes Gaussian position errors of the stated covariance without bias, and lists of about one instant.
-    A stale list of a moving object, a biased unit or too small a covariance leaves it as a duplicate; objects closer
-    than the gate may swap or merge members; units that repeat each other are counted as often as they speak, unless
-    covariances are intersected; existence always is.
+    Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py and the files beside it, and for the
+    running state by which clusters that do not count all as independent are compared W. Niehsen, "Information fusion
+    based on fast covariance intersection filtering", FUSION 2002. Assumes Gaussian position errors of the stated
+    covariance without bias, and lists of about one instant. A stale list of a moving object, a biased unit or too small
+    a covariance leaves it as a duplicate; objects closer than the gate may swap or merge members; units that repeat
+    each other are counted as often as they speak by inverse variance; existence always is.
     """
 
     kind: Literal["gnn"] = "gnn"
-    combine: Literal["inverse_variance", "covariance_intersection", "fast_covariance_intersection"] = "inverse_variance"
+    combine: Literal[
+        "inverse_variance", "covariance_intersection", "fast_covariance_intersection",
+        "inverse_covariance_intersection", "split_covariance_intersection", "cross_covariance", "covariance_union",
+    ] = "inverse_variance"  # fmt: skip
     minimise: Literal["trace", "determinant"] = "trace"
-    gate: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.99
+    gate: Gate = 0.99
     min_existence: Share = 0.0
+    # Chosen where they are not said: half of everything, and the gate.
+    dependent_share: Share | None = Field(None, exclude_if=_absent)
+    dependent_m2: NotNegative | None = Field(None, exclude_if=_absent)
+    correlation: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = Field(None, exclude_if=_absent)
+    conflict_gate: Gate | None = Field(None, exclude_if=_absent)
 
     resumable: ClassVar[bool] = True
+
+    @model_validator(mode="before")
+    @classmethod
+    def _said(cls, given: Any) -> Any:
+        """What is not said of the keys of one way to combine, so that an experiment that is written back says it."""
+        if not isinstance(given, dict):
+            return given
+        own = dict(_KEYS_OF.get(str(given.get("combine")), {}))
+        if "conflict_gate" in own:
+            own["conflict_gate"] = given.get("gate", own["conflict_gate"])
+        if any(given.get(name) is not None for name in own):
+            return given
+        return {name: value for name, value in own.items() if name != "dependent_m2"} | {
+            name: value for name, value in given.items() if name not in own
+        }
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        for combine, own in _KEYS_OF.items():
+            for name in own:
+                if getattr(self, name) is not None and self.combine != combine:
+                    raise ValueError(f"{name}: expected only with combine: {combine}, found with {self.combine}")
+        if self.dependent_share is not None and self.dependent_m2 is not None:
+            raise ValueError("dependent_m2: expected alone, found beside dependent_share: leave one of them out")
+        return self
+
+    @property
+    def _method(self) -> tuple[int, float] | None:
+        """How members are combined whose errors hang together, and to what degree; None: in another way."""
+        if self.combine == "inverse_covariance_intersection":
+            return INVERSE, 0.0
+        for method, setting in (
+            (SPLIT_BY_SHARE, self.dependent_share), (SPLIT_BY_VARIANCE, self.dependent_m2), (CROSS, self.correlation),
+        ):  # fmt: skip
+            if setting:  # 0 is inverse variance
+                return method, setting
+        return None
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
         """Every run by itself."""
         runs = []
-        informed = self.combine == "inverse_variance"
+        method = self._method
+        informed = method is None and self.combine not in ("covariance_intersection", "fast_covariance_intersection")
         for bounds in inputs.lists.start:
             entries = inputs.lists.entries[bounds[0] : bounds[-1]]
             clusters, fused = fuse_run(
                 entries, numbers(entries), bounds - bounds[0], inputs.captured_s, inputs.arrives_s, inputs.newest,
                 AGREE, -2 * math.log1p(-self.gate), informed, self.min_existence,
             )  # fmt: skip
-            if not informed:
+            if method is not None:
+                combine_members(clusters, *method, self.minimise == "determinant", fused)
+            elif self.combine == "covariance_union":
+                clusters, fused = self._united(clusters, fused, entries, inputs)
+            elif not informed:
                 fast = self.combine == "fast_covariance_intersection"
                 intersect(clusters, self.minimise == "determinant", fast, fused)
             runs.append((clusters.start, fused))
         return run_after_run(runs, len(inputs.issue_s))
+
+    def _united(self, clusters: Clusters, fused: Entries, entries: Entries, inputs: Inputs) -> tuple[Clusters, Entries]:
+        gate = -2 * math.log1p(-(self.gate if self.conflict_gate is None else self.conflict_gate))
+        return unite(clusters, fused, entries, inputs.captured_s, inputs.arrives_s, AGREE, gate)
 
 
 def numbers(entries: Entries) -> Float:

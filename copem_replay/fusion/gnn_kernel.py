@@ -31,7 +31,7 @@ _OPPOSED = 1e-9
 _SURPLUS = 1e-9
 """By how much the dearest allowed pair beats none (chosen: any positive number does)."""
 
-_POINT = np.dtype(
+POINT = np.dtype(
     [
         ("x_m", "f8"), ("y_m", "f8"), ("ee", "f8"), ("en", "f8"), ("nn", "f8"),  # position, covariance in m²
         ("kind", "i8"),  # most probable class
@@ -72,7 +72,7 @@ def fuse_run(
         for f in newest[k]:
             here += first[f + 1] - first[f] if f >= 0 else 0
         most, total = max(most, here), total + here
-    states, class_sum = np.empty(most, _POINT), np.empty((most, len(CLASSES)))
+    states, class_sum = np.empty(most, POINT), np.empty((most, len(CLASSES)))
     by_x, partner, claimed = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     row, col = np.empty(most + 64, np.int64), np.empty(most + 64, np.int64)
     cost, spread = np.empty(most + 64), np.empty(most + 64)
@@ -95,7 +95,7 @@ def fuse_run(
                     states[c], class_sum[c] = point, 0.0
                     count += 1
                 else:
-                    _join(states[c], point, informed)
+                    join(states[c], point, informed)
                 for h in range(len(CLASSES)):
                     class_sum[c, h] += entries[point.row].class_probability[h]
                 if states[c].kind != point.kind:
@@ -109,7 +109,7 @@ def fuse_run(
         fused = _lengthened(fused, s, s + count)
         for c in range(count):
             members = member[begin[s + c] : begin[s + c + 1]]
-            _write(fused[s + c], states[c], class_sum[c], members, points, entries, captured_s, arrives_s)
+            write_entry(fused[s + c], states[c], class_sum[c], members, points, entries, captured_s, arrives_s)
     made = start[instants]
     return Clusters(start, begin[: made + 1], member, points), fused[:made]
 
@@ -148,7 +148,7 @@ def _points(entries: Entries, content: Float, bounds: Int, newest: Int, min_exis
                 n += 1
         first[f + 1] = n
         sort_rows(content, rows[first[f] : n])
-    points = np.empty(n, _POINT)
+    points = np.empty(n, POINT)
     for f in range(len(bounds) - 1):
         for i in range(first[f], first[f + 1]):
             point, entry = points[i], entries[rows[i]]
@@ -241,7 +241,7 @@ def _allowed_pairs(
 
 
 @nb.njit(cache=True, nogil=True)
-def _join(cluster: Any, entry: Any, informed: bool) -> None:
+def join(cluster: Any, entry: Any, informed: bool) -> None:
     """Takes an entry into a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
 
     α = β = 1, or in proportion to 1/tr A, 1/tr B with sum 1.
@@ -303,7 +303,7 @@ def _lengthened(entries: Entries, used: int, needed: int) -> Entries:
 
 
 @nb.njit(cache=True, nogil=True)
-def _write(
+def write_entry(
     out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, captured_s: Float,
     arrives_s: Float,
 ) -> None:  # fmt: skip

@@ -41,11 +41,15 @@ class Tracker(ListFusion):
     captures that support it span `confirm_s`. Of two tracks as close as two entries of one object may be (d² within the
     median of χ²), which no list held both for `forget_s`, the younger ends. Yaw and height above ground are the newest
     entry's, size and class probabilities the mean of all.
+    `errors_last_s` τ: the position errors of one unit about one object decay as e^(−Δ/τ), so an entry counts as a fresh
+    one of R·(1 + φ)/(1 − φ), φ = e^(−Δ/τ) of the time since that unit's last about the track; the first counts fully,
+    and an object at rest gets the variance of the best linear estimate. `common_share`: so much of each R may hang
+    together with anything, and does not shrink (split covariance intersection); `errors_last_s` then tells of the rest.
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001.
     Assumes white acceleration of density q = `acceleration_psd_m2ps3`, Gaussian position errors of the stated
-    covariance, independent between lists and units, without bias. A turning or braking object lags behind, its track
-    too sure of itself; a biased unit, or one whose errors persist, splits objects or pulls them along; an object not
-    listed beside its neighbour can be taken for it as long as it is within the gate.
+    covariance, independent between lists and units where these two do not say otherwise, without bias. A turning or
+    braking object lags behind, its track too sure of itself; a biased unit, or one whose errors persist, splits objects
+    or pulls them along; an object not listed beside its neighbour can be taken for it as long as it is within the gate.
     """
 
     kind: Literal["tracker"] = "tracker"
@@ -59,6 +63,9 @@ class Tracker(ListFusion):
     drop: Share = 0.05
     confirm_s: NotNegative = 0.1
     buffer_s: Positive = 2.0
+    # Left out: errors are fresh in every list, and independent.
+    errors_last_s: Positive | None = Field(None, exclude_if=lambda value: value is None)
+    common_share: Share | None = Field(None, exclude_if=lambda value: value is None)
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
@@ -84,6 +91,7 @@ class Tracker(ListFusion):
         rules = Rules(
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
             self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
+            self.errors_last_s or 0.0, self.common_share or 0.0,
         )  # fmt: skip
         arrived, start = _gone_by(inputs) if self.late == "stale" else (inputs.arrived, inputs.arrived_start)
         so_far = memory or [nothing_yet(len(inputs.units))] * len(inputs.lists.start)

@@ -21,6 +21,7 @@ from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.covariance import floored
 from copem_replay.fusion.tracker_filter import distance2, predict, update
 from copem_replay.fusion.tracker_memory import CLAIM, TRACK, Memory, Remembered, recalled, remembered
+from copem_replay.fusion.tracker_split import carry, update_split
 
 STALE, PREDICT, REPLAY = 0, 1, 2
 ENTRIES_PER_LIST = 65536
@@ -29,6 +30,8 @@ SAME_OBJECT = 1.386
 """Tracks whose next entries would be as close as this, d², can be of one object: the median of χ² with 2 degrees of
 freedom (chosen), so half of the pairs of entries of one object are closer."""
 _SAME_S = SAME_INSTANT_NS * 1e-9
+_NOTHING_NEW = 1e12
+"""An entry that counts as one of so many times the variance says nothing new: errors last too long (chosen)."""
 _LEAST_COST = 1e-6
 """What the worst pair within the gate is better than none (chosen: small against the differences between pairs)."""
 
@@ -57,6 +60,8 @@ class Rules(NamedTuple):
     confirm_s: float
     buffer_s: float
     agree: Bool  # (C, C)
+    errors_last_s: float  # 0: errors are fresh in every list
+    common_share: float
 
 
 # ------------------------------------------------------------------------------------------------------------- one run
@@ -155,6 +160,8 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
     for track in memory.tracks:
         if track.at_s < now_s:
             predict(track.state, track.P, now_s - track.at_s, rules.q_m2ps3)
+            if rules.common_share > 0.0:
+                carry(track.common, now_s - track.at_s)
             track.at_s = now_s
     said_s = now_s if rules.late == STALE else said.captured_s[f]
     seen = _seen(said, rules, f, now_s)
@@ -166,12 +173,21 @@ def _hear(memory: Memory, said: Said, rules: Rules, f: int, now_s: float) -> Mem
         entry, x, y, ee, en, nn = said.entries[rows[i]], seen[i, 0], seen[i, 1], seen[i, 2], seen[i, 3], seen[i, 4]
         if partner[i] >= 0:
             track = memory.tracks[partner[i]]
-            update(track.state, track.P, x, y, ee, en, nn)
+            # As much as fresh errors of so much more variance would say: those of a unit last, about each object.
+            last_s = memory.claims[partner[i], said.unit_ix[f]].at_s
+            grown = 1.0
+            if rules.errors_last_s > 0.0 and last_s > -math.inf:
+                grown = math.tanh(abs(said_s - last_s) / (2.0 * rules.errors_last_s))
+                grown = 1.0 / grown if grown > 0.0 else math.inf
+            if rules.common_share > 0.0:
+                update_split(track.state, track.P, track.common, seen[i], rules.common_share, grown)
+            elif grown < _NOTHING_NEW:
+                update(track.state, track.P, x, y, grown * ee, grown * en, grown * nn)
         else:
             partner[i] = n
             n += 1
             track = memory.tracks[partner[i]]
-            _found(track, entry, x, y, ee, en, nn, rules.speed_var_m2ps2)
+            _found(track, entry, x, y, ee, en, nn, rules)
             track.at_s, track.first_s, track.last_s = now_s, said.captured_s[f], said.captured_s[f]
             track.unit_ix, track.track_id = said.unit_ix[f], f * ENTRIES_PER_LIST + i
         track.ee, track.en, track.nn = ee, en, nn
@@ -254,10 +270,13 @@ def _with_room(memory: Memory, more: int) -> Memory:
 
 
 @nb.njit(cache=True, nogil=True)
-def _found(track: Any, entry: Any, x: float, y: float, ee: float, en: float, nn: float, speed_var: float) -> None:
+def _found(track: Any, entry: Any, x: float, y: float, ee: float, en: float, nn: float, rules: Rules) -> None:
     track.state[0], track.state[1], track.state[2], track.state[3] = x, y, entry.vx_mps, entry.vy_mps
     track.P[0, 0], track.P[0, 1], track.P[1, 0], track.P[1, 1] = ee, en, en, nn
-    track.P[2, 2] = track.P[3, 3] = speed_var
+    track.P[2, 2] = track.P[3, 3] = rules.speed_var_m2ps2
+    for a in range(2):
+        for b in range(2):
+            track.common[a, b] = rules.common_share * track.P[a, b]
 
 
 @nb.njit(cache=True, nogil=True)

@@ -14,6 +14,7 @@ TRACK = np.dtype(
     [
         ("state", "f8", (4,)),  # x, y, vx, vy at `at_s`
         ("P", "f8", (4, 4)),
+        ("common", "f8", (4, 4)),  # the part of P that may hang together with what is yet to come; 0 without a share
         ("at_s", "f8"),
         ("ee", "f8"), ("en", "f8"), ("nn", "f8"),  # R of the entry heard last
         ("z_m", "f8"),  # z and yaw of the newest entry

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from copem_replay.core.components import Covariance, Frozen, Number, Positive, Share
+from copem_replay.core.components import Covariance, Frozen, Id, Latency, NotNegative, Number, Positive, Share
 from copem_replay.io.schemas.object_lists import Fields
-
-Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
-"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 
 
 class Recorded(Frozen):
@@ -49,3 +46,28 @@ class EgoTopic(Frozen):
     size_m: tuple[Positive, Positive, Positive] | None = None
     centre_from_rear_axle_m: Number | None = None
     frame: str | None = None
+
+
+def _how_read(value: object) -> str:
+    named = isinstance(value, ReadFields) or (isinstance(value, dict) and len(value.keys() - {"topic"}) > 0)
+    return "fields" if named else "topic"
+
+
+HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
+
+
+def _what_ego(value: object) -> str:
+    return "topic" if isinstance(value, dict | EgoTopic) else "id"
+
+
+Ego = Annotated[Annotated[Id, Tag("id")] | Annotated[EgoTopic, Tag("topic")], Discriminator(_what_ego)]
+
+
+def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:
+    from_s, to_s = window_s
+    if from_s is not None and to_s is not None and from_s > to_s:
+        raise ValueError(f"expected [from, to], found one that ends ({to_s:g} s) before it begins ({from_s:g} s)")
+    return window_s
+
+
+WindowOf = Annotated[tuple[NotNegative | None, NotNegative | None], AfterValidator(_in_order)]

@@ -114,6 +114,34 @@ def gospa_pairs(
     return localisation, pairs
 
 
+def gospas_m(truth: Float, starts: Int, estimates: Float, begins: Int, cutoff_m: float, power: float) -> Float:
+    """GOSPA (m) of many lists (K,): `truth (2, P)` and `estimates (2, R)`, list k from `starts[k]` and `begins[k]` on.
+
+    `starts` and `begins` have one entry more, the end of the last list. Raises ValueError as `gospa` does.
+    """
+    unit = _unit(cutoff_m, power)
+    if not (np.isfinite(truth).all() and np.isfinite(estimates).all()):
+        raise ValueError("expected finite positions")
+    tx, ty, bx, by = (np.ascontiguousarray(of, dtype=np.float64) for of in (*truth, *estimates))
+    total = np.empty(len(starts) - 1)
+    _totals(tx, ty, starts, bx, by, begins, float(cutoff_m), float(power), unit, total)
+    value_m: Float = total ** (1 / power)
+    return value_m
+
+
+@nb.njit(cache=True, nogil=True)
+def _totals(
+    tx: Float, ty: Float, starts: Int, bx: Float, by: Float, begins: Int,
+    cutoff_m: float, power: float, unit: float, total: Float,
+) -> None:  # fmt: skip
+    """Out: `total (K,)`, GOSPA to the power p."""
+    for k in range(len(total)):
+        i, j, m, n = starts[k], starts[k + 1], begins[k], begins[k + 1]
+        partner = np.empty(j - i, dtype=np.int64)
+        localisation, pairs = gospa_pairs(tx[i:j], ty[i:j], bx[m:n], by[m:n], cutoff_m, power, partner)
+        total[k] = localisation + unit / 2 * ((j - i - pairs) + (n - m - pairs))
+
+
 @nb.njit(cache=True, inline="always")
 def _to_the(power: float, squared: float) -> float:
     """A distance to the power p, from its square."""

@@ -31,6 +31,9 @@ BLOCK_BYTES = 200_000_000
 STATE_BYTES = 400
 """Bytes of a row × run cell where states are sampled, fused and measured, else one (chosen: fifty numbers)."""
 
+LASTING_BYTES = 40
+"""Without states, where detection lasts: numbers themselves, not only whether they are below p (chosen)."""
+
 WORTH_A_BLOCK = 1_000_000
 """Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
 
@@ -61,7 +64,8 @@ def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
     even = -(-experiment.runs // jobs)
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
     small = max(-(-even // 8), WORTH_A_BLOCK // rows)
-    at_once = BLOCK_BYTES // (rows * (STATE_BYTES if states else 1))
+    lasts = any(pem.memory_of(c).get("detection") for pem in experiment.pems.values() for c in range(len(pem.couples)))
+    at_once = BLOCK_BYTES // (rows * (STATE_BYTES if states else LASTING_BYTES if lasts else 1))
     size = max(1, min(at_once, even, small))
     return [np.arange(k, min(k + size, experiment.runs)) for k in range(0, experiment.runs, size)]
 

@@ -19,6 +19,7 @@ import pandas as pd
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Float, Int, Tracks
+from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.braking.driver import Reaction
 from copem_replay.metrics.braking.verdict import fail_probability, pass_probability
@@ -76,7 +77,7 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     _check_truth_ids(experiment)
     hits = experiment.measure.confirm.hits
     for replay in ready:
-        units = replay.expanded.with_(experiment)
+        units = replay.expanded.with_(of_log(experiment, replay.scene.log))
         for name in units.configurations:
             lasts = check_lasting(units, name, hits)
             if hits == 1 and not lasts:

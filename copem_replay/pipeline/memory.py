@@ -20,7 +20,7 @@ ABOUT_BYTES = {False: 1000, True: 5000}
 
 def memory_notes(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
     """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do."""
-    rows_a_run = sum(len(replay.episodes.object_ix) for replay in ready) * len(experiment.configurations)
+    rows_a_run = sum(len(r.episodes.object_ix) * len(r.expanded.written.configurations) for r in ready)
     about, free = rows_a_run * ABOUT_BYTES[experiment.measure.accuracy], free_bytes()
     if free is None or about * experiment.runs <= free:
         return []

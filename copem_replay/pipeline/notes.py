@@ -11,6 +11,7 @@ from copem_replay.core.interpolation import wrap
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Scene, Tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.experiment.drive import of_log, settings_notes
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import Ideal
 from copem_replay.io.recording import Recording
@@ -37,7 +38,9 @@ def notes_of(
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
     for replay in ready:
         met = replay.ever_met if replayed else None
-        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, experiment, met)]
+        alone = of_log(experiment, replay.scene.log)
+        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, alone, met)]
+    notes += settings_notes(experiment)
     notes += without_points(experiment)
     notes += _remembered_in_vain(experiment)
     if experiment.measure.accuracy and not same_instants(ready):

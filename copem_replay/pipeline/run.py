@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.fixed import fixed_in
@@ -60,7 +61,7 @@ def run(
     """
     with watched() as cost:
         if ready is None:
-            ready = [prepare(recording, experiment) for recording in recordings]
+            ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
             check_closed_form(ready, experiment)
             memory_notes(ready, experiment)
         tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)), cost)
@@ -106,7 +107,7 @@ def _at_point(
     """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
     experiment = point.experiment
     if not point.same_units:
-        ready = [prepare(recording, experiment) for recording in recordings]
+        ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
     table, parts, _ = tables.of(ready, experiment)
     rows, _ = summary(
         table,
@@ -126,7 +127,7 @@ def _at_point(
 def _exactly(ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame | None:
     if not experiment.measure.exact:
         return None
-    return pd.concat([exact_table(replay, experiment) for replay in ready], ignore_index=True)
+    return pd.concat([exact_table(replay, of_log(experiment, replay.scene.log)) for replay in ready], ignore_index=True)
 
 
 class _Tables:
@@ -139,11 +140,16 @@ class _Tables:
         self, ready: Sequence[Replay], experiment: Experiment
     ) -> tuple[pd.DataFrame, list[Outcome], NDArray[np.int64]]:
         """The rows of `detections.parquet` of an experiment; all outcomes, and the order their rows have got."""
-        work = [(replay, block) for replay in ready for block in blocks(replay, experiment, self._jobs)]
+        work = [
+            (replay, alone, block)
+            for replay in ready
+            for alone in (of_log(experiment, replay.scene.log),)
+            for block in blocks(replay, alone, self._jobs)
+        ]
         parts: list[list[Outcome]] = []
         pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
         try:
-            for part in pool.map(lambda item: outcomes(item[0], experiment, item[1]), work):
+            for part in pool.map(lambda item: outcomes(*item), work):
                 parts.append(part)
                 if self._progress is not None:
                     self._progress(self._done * len(work) + len(parts), self._tables * len(work))
@@ -165,8 +171,8 @@ def _order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> NDAr
 
 
 def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float | None]:
-    rates = [list_rates(replay, experiment) for replay in ready]
-    return {name: _rate([of_log[name] for of_log in rates]) for name in experiment.configurations}
+    rates = [list_rates(replay, of_log(experiment, replay.scene.log)) for replay in ready]
+    return {name: _rate([one[name] for one in rates if name in one]) for name in experiment.configurations}
 
 
 def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:

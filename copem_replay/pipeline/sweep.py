@@ -13,7 +13,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.schema import Configuration, Experiment, SweptBy, Unit
+from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.experiment.sweep_keys import SweptBy
 from copem_replay.fusion.base import ListFusion
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers

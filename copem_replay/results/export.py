@@ -45,6 +45,7 @@ class Exporter:
 def _write_mcap(path: Path, run: RunToExport) -> list[str]:
     from copem_replay.io.write.mcap import write_mcap
     from copem_replay.io.write.message_family import family_of
+    from copem_replay.results.truth_scene import truth_scene
 
     recording = run.recording
     return write_mcap(
@@ -56,6 +57,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         run.manifest,
         family_of(recording),
         recording.window,
+        truth_scene(run.one, run.table),
     )
 
 

@@ -193,7 +193,8 @@ class Results:
     def log_path(self, log: str) -> Path:
         """Where the recording of a log is expected."""
         number = [file.name for file in self.provenance.logs].index(log)
-        return self.folder / self.experiment.logs[number]
+        entry = self.experiment.logs[number]
+        return self.folder / (entry if isinstance(entry, str) else entry.file)
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""
@@ -263,8 +264,11 @@ def _check(folder: Path, table: pd.DataFrame, experiment: Experiment) -> None:
         raise InputError(f"{place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
     if not len(table):
         raise InputError(f"{place}: expected rows to draw, found none: no measured object has an onset")
-    counts = [int((table["configuration"] == name).sum()) for name in experiment.configurations]
-    if min(counts) != max(counts):
+    # A configuration that has none of its units in a log is left out of that log.
+    counts = [int(n) for n in table.groupby(["log", "configuration"], sort=False).size()]
+    counts += [0] * (set(experiment.configurations) != set(table["configuration"]))
+    of_log = table.groupby(["log", "configuration"], sort=False).size().groupby("log").agg(["min", "max"])
+    if 0 in counts or (of_log["min"] != of_log["max"]).any():
         raise InputError(
             f"{place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
         )

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import RecordingError
+from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.checksum import sha256_of
@@ -22,8 +23,9 @@ def reread(results: Results, log: str, object_id: str) -> Replay:
 
     Raises RecordingError, one line, where the recording is missing or not the one that was replayed, or has no ego.
     """
-    measure = results.experiment.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
-    experiment = results.experiment.model_copy(update={"measure": measure})
+    alone = of_log(results.experiment, log)
+    measure = alone.measure.model_copy(update={"objects": Objects(ids=(object_id,))})
+    experiment = alone.model_copy(update={"measure": measure})
     recording = read_again(results, log, experiment)
     if recording.scene.ego_ix < 0:
         raise RecordingError("no ego in this study, whose runs could be drawn", path=recording.path)
@@ -47,7 +49,7 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
             "put that log back, or run the experiment again",
             path=path,
         )
-    recordings, refused = read_logs(experiment, [path], results.source)
+    recordings, refused = read_logs(of_log(experiment, log), [path], None)
     if refused:
         raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
     # Draws are addressed by the log's name, which depends on what else was replayed.

@@ -19,6 +19,7 @@ import pandas as pd
 from copem_replay.core.csv_names import for_spreadsheets
 from copem_replay.core.errors import OutputError
 from copem_replay.core.yaml import dump
+from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import place_of
 from copem_replay.io.checksum import sha256_of
@@ -106,7 +107,7 @@ def _fill(
 ) -> list[str]:
     """Write all files but the provenance. Returns notes for the user."""
     data, scratch = resolved(experiment).as_written(), place.new
-    data["logs"] = [os.path.relpath(place_of(recording.path), place.folder) for recording in recordings]
+    data["logs"] = _entries(data["logs"], recordings, place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
     write_csv(result.summary, scratch / "summary.csv")
@@ -127,11 +128,21 @@ def _fill(
     return notes
 
 
+def _entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
+    """`logs` as the folder has it: a path relative to it each, with the log's settings where it has some."""
+    paths = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
+    settings = [entry for entry in logs if isinstance(entry, dict)]
+    if len(settings) < len(recordings):
+        return paths
+    return [entry | {"file": path} for entry, path in zip(settings, paths, strict=True)]
+
+
 def _run_to_export(
     log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
 ) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
     recording = next(r for r in recordings if r.scene.log == log)
+    experiment = of_log(experiment, log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
     names = list(chosen.configurations)
     of_run = (result.table["log"] == log) & (result.table["run"] == shown.run)

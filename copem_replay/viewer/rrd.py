@@ -112,8 +112,8 @@ def _streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | None) -
 
 
 def _send_blueprint(out: Out, panels: rrb.Blueprint) -> None:
-    """To the file so that a layout changed by the user stays, to a viewer so that its own heuristics do not apply."""
-    out.rec.send_blueprint(panels, make_active=False)
+    """Active, so that neither the heuristics of a viewer apply nor, in a browser, a layout of its own."""
+    out.rec.send_blueprint(panels, make_active=True)
     if out.live is not None:
         out.live.send(lambda rec: rec.send_blueprint(panels, make_active=True))
 

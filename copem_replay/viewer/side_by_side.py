@@ -15,6 +15,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.tracks import SAME_INSTANT_NS
+from copem_replay.experiment.drive import of_log
 from copem_replay.pipeline.blocks import replay_block
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.selected_runs import STEM, OneRun, one_run
@@ -67,6 +68,11 @@ def write_beside(
     wanted = chosen(named(read), configurations, baseline)
     used = [complete(results) for results in dict.fromkeys(one.results for one in wanted)]
     log, number = _which(used[0], used, log, run)
+    for one in wanted:
+        if one.configuration not in of_log(one.results.experiment, log).configurations:
+            raise InputError(
+                f"configuration {one.label}: log {log} has none of its units; choose another log with --log"
+            )
     sides = [_side(results, [one for one in wanted if one.results is results], log, number) for results in used]
     parts = [Part(side.results.name, side.one.experiment, side.labels) for side in sides]
     experiment = merged(parts)
@@ -84,7 +90,7 @@ def write_beside(
     table = pd.concat([side.rows.assign(configuration=side.rows["configuration"].map(side.labels)) for side in sides])
     write_rrd(
         path,
-        prepare(recording, experiment, onsets_of=sides[0].results.experiment),
+        prepare(recording, experiment, onsets_of=of_log(sides[0].results.experiment, log)),
         experiment,
         [{one.label: run_tracks[one.label] for one in wanted}],
         table.reset_index(drop=True),
@@ -112,8 +118,9 @@ def _which(first: Results, every: Sequence[Results], log: str | None, run: int |
 def _side(results: Results, wanted: Sequence[Named], log: str, run: int) -> _Side:
     """One folder's part of the run, computed once more. Raises InputError where its table says otherwise."""
     labels = {one.configuration: one.label for one in wanted}
-    kept = {name: configuration for name, configuration in results.experiment.configurations.items() if name in labels}
-    experiment = results.experiment.model_copy(update={"configurations": kept, "sweep": None})
+    alone = of_log(results.experiment, log)
+    kept = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
+    experiment = alone.model_copy(update={"configurations": kept, "sweep": None})
     one = one_run(read_again(results, log, experiment), experiment, run)
     of_run = results.table[(results.table["log"] == log) & (results.table["run"] == run)]
     rows = of_run[of_run["configuration"].isin(list(kept))]

@@ -15,6 +15,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
+from copem_replay.viewer import opening
 from tests.helpers.experiments import TEXT, drive
 
 ROOT = Path(__file__).parents[2]
@@ -267,10 +268,10 @@ class TestFolders:
 
     def test_view_opens_the_recordings(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         cr.run("shown.yaml").save("out/e")
-        called: list[list[str]] = []
-        monkeypatch.setattr(subprocess, "call", lambda words: called.append(words) or 0)
+        called: list[tuple[Path, list[Path]]] = []
+        monkeypatch.setattr(opening, "open_viewer", lambda folder, files: called.append((folder, files)) or 0)
         cr.view(cr.load_results("out/e"))
-        assert called == [[sys.executable, "-m", "rerun", str(here / "out/e/replay.rrd")]]
+        assert called == [(Path("out/e"), [here / "out/e/replay.rrd"])]
 
 
 class TestRecordings:

@@ -45,11 +45,15 @@ FUSIONS: list[ListFusion] = [
     Gnn(),
     Gnn(combine="covariance_intersection"),
     Gnn(combine="fast_covariance_intersection"),
+    Gnn(combine="split_covariance_intersection"),
+    Gnn(combine="covariance_union"),
     Tracker(late="stale", publish=0.2),
     Tracker(late="predict", publish=0.2),
     Tracker(late="replay", publish=0.2),
     Tracker(late="replay", buffer_s=0.2),
     Tracker(late="replay", buffer_s=10.0),
+    Tracker(late="predict", publish=0.2, errors_last_s=0.5),
+    Tracker(late="replay", publish=0.2, errors_last_s=0.5, common_share=0.3),
     Walk(),
 ]
 

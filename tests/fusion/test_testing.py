@@ -28,9 +28,17 @@ OURS = [
     Gnn(combine="covariance_intersection"),
     Gnn(combine="covariance_intersection", minimise="determinant"),
     Gnn(combine="fast_covariance_intersection"),
+    Gnn(combine="inverse_covariance_intersection"),
+    Gnn(combine="split_covariance_intersection"),
+    Gnn(combine="split_covariance_intersection", dependent_m2=0.1, minimise="determinant"),
+    Gnn(combine="cross_covariance"),
+    Gnn(combine="covariance_union", conflict_gate=0.9),
     Tracker(late="stale"),
     Tracker(late="predict"),
     Tracker(late="replay"),
+    Tracker(late="stale", errors_last_s=0.5),
+    Tracker(late="predict", errors_last_s=0.5, common_share=0.3),
+    Tracker(late="replay", common_share=0.3),
 ]
 
 

@@ -66,6 +66,11 @@ class Viewer:
     def entities(self) -> set[str]:
         return {entity.entity_path for entity in self._client.get_recording_schema().entities}
 
+    def cursors(self) -> dict[str, tuple[str | None, int | None]]:
+        """Timeline and instant, in its unit, of each recording by its id."""
+        recordings = self._client.get_state().recordings
+        return {one.store_id.rpartition(":")[2]: (one.current_timeline, one.current_time) for one in recordings}
+
     def seek(self, elapsed_s: float) -> None:
         self._client.set_time("elapsed", duration=elapsed_s, play_state="paused")
 

@@ -469,7 +469,9 @@ def test_a_real_recording_of_autoware(tmp_path: Path) -> None:
     (tmp_path / "e.yaml").write_text(text)
     recording, path = folder_of(tmp_path / "e.yaml")
     kinds = {type(m).__name__ for _, _, m in decoded(path)}
-    assert {k.rsplit("__", 1)[-1] for k in kinds} == {"DetectedObjects", "SceneUpdate", "String"}
+    assert {k.rsplit("__", 1)[-1] for k in kinds} == {
+        "DetectedObjects", "SceneUpdate", "String", "Status", "FrameTransform",
+    }  # fmt: skip
     lists = list(decoded(path, "copem/GT/objects"))
     assert len(lists) == len(recording.truth.stamp_ns)
     assert sum(len(m.objects) for _, _, m in lists) > 1000

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from copem_replay.metrics.gospa import gospa, gospa_pairs, ospa
+from copem_replay.metrics.gospa import gospa, gospa_pairs, gospas_m, ospa
 
 Points = npt.NDArray[np.float64]
 
@@ -291,3 +291,11 @@ def test_a_defect_of_the_caller_is_said(
 def test_gospa_has_no_infinite_power():
     with pytest.raises(ValueError, match="power"):
         gospa(FIVE, FIVE, cutoff_m=5.0, power=math.inf)
+
+
+@given(st.lists(st.tuples(point_sets(4), point_sets(4)), max_size=6), cutoffs, powers)
+def test_of_many_lists_each_is_that_of_its_own(lists: list[tuple[Points, Points]], c: float, p: float):
+    both = [np.concatenate([NOBODY, *(pair[side] for pair in lists)]).T for side in (0, 1)]
+    starts = [np.cumsum([0, *(len(pair[side]) for pair in lists)]) for side in (0, 1)]
+    found = gospas_m(both[0], starts[0], both[1], starts[1], c, p)
+    assert found == pytest.approx([gospa(*pair, cutoff_m=c, power=p).value_m for pair in lists], rel=1e-14)

@@ -6,18 +6,22 @@ pairs are looked at, and `scipy.optimize.linear_sum_assignment` assigns. Positio
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import shapely
+import shapely.affinity
 from scipy.optimize import linear_sum_assignment, minimize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from copem_replay.core.object_list import Entries, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES
+from copem_replay.fusion.covariance_union import covariance_union
 from tests.helpers.reports import inputs_of
+from tests.oracles import correlated
 
 Array = npt.NDArray[Any]
 
@@ -29,6 +33,7 @@ def fuse(
     minimise: str = "trace",
     gate: float = 0.99,
     min_existence: float = 0.0,
+    setting: float = 0.0,
 ) -> ObjectLists:
     """The fused lists of all runs."""
     ends, fused = [], [entries_of(0)]
@@ -40,19 +45,32 @@ def fuse(
             for f in newest[newest >= 0]:
                 one = inputs.lists.of(run, f)
                 lists.append((one[one["existence"] >= min_existence], inputs.captured_s[f], inputs.arrives_s[f]))
-            fused.append(fuse_instant(lists, combine=combine, minimise=minimise, gate=gate))
+            fused.append(fuse_instant(lists, combine=combine, minimise=minimise, gate=gate, setting=setting))
             total += len(fused[-1])
             ends[-1].append(total)
     return ObjectLists(np.array(ends, dtype=np.int64), np.concatenate(fused))
 
 
-def fuse_instant(lists: Sequence[tuple[Entries, float, float]], *, combine: str, minimise: str, gate: float) -> Entries:
-    """One fused list from (entries, captured, arrives) of each unit."""
+def fuse_instant(
+    lists: Sequence[tuple[Entries, float, float]], *, combine: str, minimise: str, gate: float, setting: float = 0.0
+) -> Entries:
+    """One fused list from (entries, captured, arrives) of each unit.
+
+    `setting`: the one number of a way to combine (share, variance in m², correlation, gate of conflicts).
+    """
     entries, captured_s, arrives_s, bounds = _stacked(lists)
     if len(entries) == 0:
         return entries_of(0)
-    cluster = _clusters(entries, bounds, -2 * math.log(1 - gate), combine == "inverse_variance")
-    return _summaries(entries, captured_s, arrives_s, cluster, combine, minimise)
+    independent = combine in ("inverse_variance", "covariance_union")
+    cluster = _clusters(entries, bounds, -2 * math.log(1 - gate), independent)
+    if combine == "covariance_union":
+        said = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+        found = _summaries(entries, captured_s, arrives_s, cluster, "inverse_variance", minimise, 0.0)
+        host = _united(found, cluster, said)
+        order = np.argsort(cluster, kind="stable")
+        entries, captured_s, arrives_s = entries[order], captured_s[order], arrives_s[order]
+        cluster = np.unique(host[cluster[order]], return_inverse=True)[1]
+    return _summaries(entries, captured_s, arrives_s, cluster, combine, minimise, setting)
 
 
 def _stacked(lists: Sequence[tuple[Entries, float, float]]) -> tuple[Entries, Array, Array, Array]:
@@ -128,6 +146,29 @@ def _clusters(entries: Entries, bounds: Array, threshold: float, informed: bool)
     return cluster
 
 
+def _united(found: Entries, cluster: Array, said: Array) -> Array:
+    """(clusters,) which cluster each is part of: one whose box overlaps its own most, classes agree, and no list is in
+    both. `said (M,)`: the list of each entry."""
+    boxes = []
+    for one in found:
+        box = shapely.box(-one["length_m"] / 2, -one["width_m"] / 2, one["length_m"] / 2, one["width_m"] / 2)
+        turned = shapely.affinity.rotate(box, one["yaw_rad"], origin=(0, 0), use_radians=True)
+        boxes.append(shapely.affinity.translate(turned, one["x_m"], one["y_m"]))
+    kind = _kinds(found["class_probability"])
+    host = np.arange(len(found))
+    lists = [set(said[cluster == c].tolist()) for c in range(len(found))]
+    for c in range(len(found)):
+        able = [
+            (-boxes[c].intersection(boxes[o]).area / boxes[c].union(boxes[o]).area, o)
+            for o in range(c)
+            if host[o] == o and AGREE[kind[c], kind[o]] and not lists[c] & lists[o]
+        ]
+        if able and min(able)[0] < 0:
+            host[c] = min(able)[1]
+            lists[host[c]] |= lists[c]
+    return host
+
+
 def largest_around(allowed: Array, value: Array) -> Array:
     """(P,) the largest `value (P,)` in the connected component of each of the allowed pairs (n, m)."""
     row, col = np.nonzero(allowed)
@@ -141,7 +182,7 @@ def largest_around(allowed: Array, value: Array) -> Array:
 
 
 def _summaries(
-    entries: Entries, captured_s: Array, arrives_s: Array, cluster: Array, combine: str, minimise: str
+    entries: Entries, captured_s: Array, arrives_s: Array, cluster: Array, combine: str, minimise: str, setting: float
 ) -> Entries:
     """The fused entry of each cluster."""
     order = np.argsort(cluster, kind="stable")
@@ -153,7 +194,7 @@ def _summaries(
         return np.add.reduceat(values, begin, axis=0)
 
     x, P = _mean_cov(entries)
-    mean, cov = _combined(x, P, begin, cluster, combine, minimise)
+    mean, cov = _combined(x, P, begin, cluster, combine, minimise, setting)
     fused["x_m"], fused["y_m"] = mean.T
     fused["cov_ee_m2"], fused["cov_en_m2"], fused["cov_nn_m2"] = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     weight = 1 / np.trace(P, axis1=1, axis2=2)
@@ -170,8 +211,16 @@ def _summaries(
     return fused
 
 
-def _combined(x: Array, P: Array, begin: Array, cluster: Array, combine: str, minimise: str) -> tuple[Array, Array]:
+def _combined(
+    x: Array, P: Array, begin: Array, cluster: Array, combine: str, minimise: str, setting: float
+) -> tuple[Array, Array]:
     """Mean and covariance of each cluster; positions are taken relative to the cluster's first."""
+    if combine in _CORRELATED:
+        parts = [
+            _CORRELATED[combine](x[a:b], P[a:b], minimise == "determinant", setting)
+            for a, b in zip(begin, [*begin[1:], len(x)], strict=True)
+        ]
+        return np.stack([mean for mean, _ in parts]), np.stack([cov for _, cov in parts])
     information = np.linalg.inv(P)
     if combine == "inverse_variance":
         weight = np.ones(len(x))
@@ -217,6 +266,30 @@ def _fast_intersection(P: Array, information: Array, _minimise: str) -> Array:
         weight = (trace <= trace.min() * (1 + 1e-12)).astype(float)
         weight /= weight.sum()
     return weight
+
+
+def _split(x: Array, P: Array, by_determinant: bool, share: float) -> tuple[Array, Array]:
+    return correlated.split_intersection(x, share * P, (1 - share) * P, by_determinant)
+
+
+def _either(x: Array, P: Array, _by_determinant: bool, gate: float) -> tuple[Array, Array]:
+    """One after the other: by inverse variance within the gate, by union beyond."""
+    a, A = x[0], P[0]
+    for b, B in zip(x[1:], P[1:], strict=True):
+        if (b - a) @ np.linalg.solve(A + B, b - a) <= -2 * math.log(1 - gate):
+            K = A @ np.linalg.inv(A + B)
+            a, A = a + K @ (b - a), A - K @ A
+        else:
+            a, A = covariance_union(a, A, b, B)
+    return a, A
+
+
+_CORRELATED: dict[str, Callable[[Array, Array, bool, float], tuple[Array, Array]]] = {
+    "inverse_covariance_intersection": lambda x, P, by, _: correlated.inverse_intersection(x, P, by),
+    "split_covariance_intersection": _split,
+    "cross_covariance": lambda x, P, _, correlation: correlated.by_correlation(x, P, correlation),
+    "covariance_union": _either,
+}
 
 
 # ------------------------------------------------------------------------------------------------ scenes

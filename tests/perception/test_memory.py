@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from copem_replay.core.random import stable_hash
 from copem_replay.core.tracks import Float, Int, Tracks
 from copem_replay.core.view_geometry import Errors, Noise, ViewGeometry
 from copem_replay.experiment.file import parse, plain
@@ -23,6 +24,7 @@ from copem_replay.perception.perceive import perceive
 from copem_replay.pipeline.notes import notes_of
 from copem_replay.pipeline.prepare import prepare
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
+from tests.oracles.lasting import Series
 
 RUNS = np.arange(4000)
 GAUSSIAN = {
@@ -300,6 +302,48 @@ def test_an_autoregression_fits_what_drifts() -> None:
     assert phi == pytest.approx(np.exp(-0.1), abs=0.03)
     assert noise == pytest.approx(0.3, abs=0.06)
     assert step / (1 - phi**2) == pytest.approx(0.7, abs=0.2)
+
+
+def test_by_which_part_a_list_goes_and_where_its_numbers_are() -> None:
+    """By the plain oracle: the choice among cumulative shares, and the address of each number; decisions 1 and 23."""
+    log = two_standing(1.0)
+    parts = [
+        {"share": 0.3, "correlation_s": 0.5}, {"share": 0.2, "correlation_s": 0.5, "of": "unit"},
+        {"share": 0.1, "correlation_s": 2.0}, {"share": 0.1, "correlation_s": "always", "of": "all"},
+    ]  # fmt: skip
+    seen, _ = seen_by(log, plan({"detection": parts}, error=None), np.arange(30))
+    row_of = {("u", "a"): of(seen, log, "u", "a"), ("v", "b"): of(seen, log, "v", "b")}
+    everyone = stable_hash("everyone")
+    for (unit, name), rows in row_of.items():
+        word = stable_hash("object", name)
+        for run in range(30):
+            for row in rows:
+                stamp = int(seen.stamp_ns[seen.frame_ix[row]])
+
+                def numbers(purpose: str, unit: str = unit, word: int = word, run: int = run) -> Series:
+                    return Series(7, log.scene.log, purpose, unit, word, run)
+
+                choice = numbers("detection part").uniforms(stamp)[0]
+                number = (
+                    numbers("detection pair 0 held").held(5e8, stamp)[0] if choice < 0.3
+                    else numbers("detection unit 0 held", word=everyone).held(5e8, stamp)[0] if choice < 0.5
+                    else numbers("detection pair 1 held").held(2e9, stamp)[0] if choice < 0.6
+                    else numbers("detection all 0 held", unit="", word=everyone).uniforms(0)[0] if choice < 0.7
+                    else numbers("detection").uniforms(stamp)[0]
+                )  # fmt: skip
+                assert seen.valid[run, row] == (number < 0.3)
+
+
+@pytest.mark.parametrize("path", ["held", "drifts"])
+@pytest.mark.parametrize("of", ["pair", "unit", "object", "all"])
+@pytest.mark.parametrize("correlation_s", [1.0, "always"])
+def test_no_rows_no_numbers(of: str, path: str, correlation_s: Any) -> None:
+    log = two_standing(1.0)
+    parts = [{"share": 0.5, "correlation_s": correlation_s, "of": of, "path": path}]
+    setup = plan({"detection": parts, "position": parts})
+    _, found = seen_by(log, setup, np.arange(3))
+    none = perceive(log.scene, found.take_rows(np.empty(0, dtype=np.int64)), setup, np.arange(3))
+    assert none.valid.shape == (3, 0)
 
 
 def test_names_of_noise() -> None:

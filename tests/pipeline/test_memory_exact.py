@@ -12,6 +12,8 @@ import pytest
 from copem_replay.experiment.file import plain
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems
+from copem_replay.pipeline.blocks import blocks
+from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import run
 from copem_replay.pipeline.sweep import points
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
@@ -261,6 +263,19 @@ def test_chunks_have_the_same_bits(of: str, path: str, rows: int) -> None:
     whole, pieces = both_ways(setup, [traffic()], rows)
     assert len(pieces.replays[0].chunks) > 1
     assert_same(whole, pieces)
+
+
+def test_blocks_are_smaller_where_detection_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The numbers themselves are held then, not one byte each."""
+    monkeypatch.setattr("copem_replay.pipeline.blocks.BLOCK_BYTES", 1_000_000)
+    measured = {"onset": {"kind": "appears"}, "accuracy": False}
+    sizes = []
+    for parts in ([], LASTING["numbers that two units share"][0]):
+        setup = plan(parts, runs=100_000, measure=measured)
+        replay = prepare(coming(), setup)
+        sizes.append(max(map(len, blocks(replay, setup, 1))))
+        rows = len(replay.measured.tracks.frame_ix)
+    assert sizes == [1_000_000 // rows, 1_000_000 // (40 * rows)]
 
 
 def test_more_workers_and_blocks_have_the_same_bits() -> None:

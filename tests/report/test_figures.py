@@ -447,6 +447,20 @@ class TestDistances:
         kinds = ("GT: passes", "hit: fails", "GT: not in conflict")
         assert len({paths[kind] for kind in kinds}) == len({colours[kind] for kind in kinds}) == 3
 
+    def test_failures_in_a_picture_are_seen_on_a_dark_page(
+        self, results: Results, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Many points are one picture in the SVG, whose black cannot turn over with the page: it has a white edge."""
+        monkeypatch.setattr("copem_replay.report.figures.distances._MANY", 3)
+        (axes,) = distances_figure(results, configurations=["hit"]).axes
+        found = {str(c.get_label()): c for c in axes.collections}
+        halo, cross = found["_halo"], found["hit: fails"]
+        assert halo.get_rasterized()
+        assert tuple(halo.get_edgecolor()[0][:3]) == (1, 1, 1)
+        assert halo.get_linewidths()[0] > cross.get_linewidths()[0]
+        assert halo.get_zorder() < cross.get_zorder()
+        np.testing.assert_array_equal(halo.get_offsets(), cross.get_offsets())
+
     def test_foreseen_collisions_have_a_panel(self, mine: Path) -> None:
         table = pd.read_parquet(mine / "detections.parquet")
         table["conflict_detected"] = table["configuration"] == "GT"

@@ -301,6 +301,19 @@ class TestWords:
         assert re.match(r"No difference to it is shown, the interval including 0: (hit|half) \(\+0\.\d+ s \[", lines[3])
         assert lines[3].endswith("]). That does not show that there is none.")
 
+    def test_winners_that_cannot_be_told_from_others_are_said_to_be_so(self, tmp_path: Path) -> None:
+        """Two configurations of the same unit tie; a third differs by draws of its own, and by an interval with 0."""
+        other = ("  eye: {", "  other: {on: ego, height_m: 1.8, pem: half}\n  eye: {")
+        tie = ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [other]}\n  again: {units: [other]}")
+        html = page(load_study(replayed(tmp_path, changed(ONE, other, tie, *ALONE[:2], ALONE[3]))))
+        lines = Page(html).lines()
+        assert re.fullmatch(
+            r"hit and again detect at the same times: after \S+ s on average\. The interval of their difference to the "
+            r"other includes 0\.",
+            lines[2],
+        )
+        assert re.search(r'half \(<span class="tight">\+\S+ s \[0, \S+\]</span>\)', html), "no line breaks within"
+
     @pytest.mark.parametrize(
         ("low", "high", "includes"), [(-1.0, 0.0, True), (0.0, 1.0, True), (-1.0, -1e-3, False), (1e-3, 1.0, False)]
     )
@@ -647,7 +660,10 @@ class TestCommands:
         assert (refused.code, len(refused.lines)) == (2, 1)
         assert not (out / "report.html").exists()
         ended = call("run", experiment, "--out", out, "--report", "--overwrite")
-        assert (ended.code, ended.out[-2:]) == (0, [f"results in {out}", f"report in {out / 'report.html'}"])
+        assert (ended.code, ended.out[-2:]) == (
+            0,
+            [f"report in {out / 'report.html'}", f"next: copem-replay report {out}"],
+        )
         first = (out / "report.html").read_bytes()
         assert call("report", out).out == [f"report in {out / 'report.html'}"]
         assert (out / "report.html").read_bytes() == first

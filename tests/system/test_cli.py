@@ -104,7 +104,7 @@ class TestUsage:
             ([], "expected a command, one of "),
             (["replay"], "No such command 'replay'."),
             (["--nope"], "No such option: --nope"),
-            (["info"], "Missing argument 'LOG...'."),
+            (["info"], "Missing argument 'LOG'."),
             (["init"], "Missing argument 'LOG'."),
             (["check"], "Missing argument 'EXPERIMENT'."),
             (["check", "a", "b"], "unexpected extra argument"),
@@ -116,10 +116,10 @@ class TestUsage:
             (["run", "e.yaml", "--seed", "1.5"], "Invalid value for '--seed': "),
             (["run", "e.yaml", "--jobs", "0"], "Invalid value for '--jobs': "),
             (["run", "e.yaml", "--jobs", "1000000"], "Invalid value for '--jobs': "),
-            (["compare"], "Missing argument 'DIR...'."),
+            (["compare"], "Missing argument 'FOLDER'."),
             (["compare", "out", "--false-positives-per-min", "-1"], "Invalid value for '--false-positives-per-min': "),
             (["compare", "out", "--false-positives-per-min", "few"], "Invalid value for '--false-positives-per-min': "),
-            (["view"], "Missing argument 'DIR'."),
+            (["view"], "Missing argument 'FOLDER'."),
             (["schema", "all"], "unexpected extra argument"),
         ],
     )
@@ -169,9 +169,9 @@ class TestInstalled:
         done = installed("run", "e.yaml", folder=here)
         assert done.returncode == 0
         assert done.stderr == ""
-        assert done.stdout.splitlines()[0].startswith("configuration  n  list_rate_hz  detected_share")
+        assert done.stdout.splitlines()[0].startswith("configuration  detected_share  95 %")
         assert [line.split()[0] for line in done.stdout.splitlines()[1:4]] == ["GT", "PEM", "coPEM"]
-        assert done.stdout.endswith("results in out/e\n")
+        assert done.stdout.endswith("results in out/e\nnext: copem-replay report out/e\n")
         assert table(here / "out" / "e").shape[0] == 12
 
     def test_wrong_input(self, here: Path) -> None:
@@ -415,7 +415,7 @@ class TestRun:
         ended = call("run", "e.yaml")
         assert ended.code == 0
         assert ended.lines == []
-        assert ended.out.endswith("results in out/e\n")
+        assert ended.out.endswith("results in out/e\nnext: copem-replay report out/e\n")
         assert sorted(written(here / "out" / "e")) == [
             "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
             "lists.parquet", "provenance.json", "summary.csv", "thresholds.parquet",
@@ -453,7 +453,8 @@ class TestRun:
         assert len(found) == 0
         assert found.dtypes["onset_s"].kind == "f"
         assert list(pd.read_csv(here / "out/e/summary.csv")["n"]) == [0, 0, 0]
-        assert ended.out.splitlines()[1].split() == ["GT", "0", "10", "–", "–", "–", "–", "–", "–", "–"]
+        assert ended.out.splitlines()[1].split() == ["GT", "–", "–", "–", "–", "–", "–", "–"]
+        assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (
             2, ["out/e: nobody was measured, so nothing can be compared: no measured object has an onset"],
@@ -1128,22 +1129,25 @@ class TestView:
         (tmp_path / "-r").mkdir()
         (tmp_path / "-r/replay.rrd").touch()
         assert call("view", "--", "-r") == (0, "", [])
-        assert json.loads(viewer.read_text()) == [str(tmp_path / "-r/replay.rrd")]
+        asked = json.loads(viewer.read_text())
+        assert asked[-1:] == [str(tmp_path / "-r/replay.rrd")]
+        assert asked[:3] == ["--bind", "127.0.0.1", "--port"]
 
     def test_opens_all_recordings(self, tmp_path: Path, call: Call, viewer: Path) -> None:
-        names = ("replay/a/c", "replay/b", "replay_worst/a/c", "replay_worst/b")
+        names = ("replay/a/c", "replay/b", "replay/b.configurations_7-12", "replay_worst/a/c", "replay_worst/b")
         for name in (*reversed(names), "figures/c"):
             (tmp_path / "r" / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / "r" / f"{name}.rrd").touch()
         assert call("view", "r").code == 0
-        assert json.loads(viewer.read_text()) == [str(tmp_path / f"r/{name}.rrd") for name in names]
+        asked = json.loads(viewer.read_text())[4:]
+        assert asked == [str(tmp_path / f"r/{name}.rrd") for name in reversed(names)], "the first is shown: opened last"
 
     def test_opens_all_runs(self, tmp_path: Path, call: Call, viewer: Path) -> None:
-        for name in ("replay_7", "replay", "replay_worst", "compared"):
+        names = ("replay", "replay.configurations_7-12", "replay_7", "replay_worst")
+        for name in (*reversed(names), "compared"):
             (tmp_path / f"{name}.rrd").touch()
         assert call("view", ".").code == 0
-        names = ("replay", "replay_7", "replay_worst")
-        assert json.loads(viewer.read_text()) == [str(tmp_path / f"{name}.rrd") for name in names]
+        assert json.loads(viewer.read_text())[4:] == [str(tmp_path / f"{name}.rrd") for name in reversed(names)]
 
     def test_viewer_that_fails(self, tmp_path: Path, call: Call, viewer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "replay.rrd").touch()
@@ -1151,7 +1155,7 @@ class TestView:
         ended = call("view", ".")
         assert ended.code == 2
         (line,) = ended.lines
-        assert line.startswith(".: the Rerun viewer could not be opened (it ended with 3); without a display, copy ")
+        assert line.startswith(".: the Rerun viewer could not be opened (it ended with 3); without a display, ")
 
     @pytest.mark.parametrize(
         ("folder", "said"),
@@ -1168,7 +1172,7 @@ class TestView:
 
     def test_interrupt(self, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "replay.rrd").touch()
-        monkeypatch.setattr(subprocess, "call", raising(KeyboardInterrupt()))
+        monkeypatch.setattr(subprocess, "Popen", raising(KeyboardInterrupt()))
         assert call("view", ".") == (130, "", ["interrupted"])
 
 

@@ -32,14 +32,35 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(ROOT.glob("docs/**/*.md"))]
 
 
-def test_readme_shows_what_its_commands_print(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    headings = [k for k, line in enumerate(lines) if line.startswith("#")]
+    picture = next(k for k, line in enumerate(lines) if line.startswith("!["))
+    assert picture < headings[1] < 20, "on the first screen"
+
+
+@pytest.mark.parametrize(
+    ("page", "runs_before", "shown"),
+    [
+        ("README.md", [], ["copem-replay run"]),
+        ("docs/worked_example.md", ["copem-replay run"], ["python tools/paper.py"]),
+        ("docs/which_fusion.md", ["copem-replay run"], ["copem-replay compare"]),
+    ],
+)
+def test_pages_show_what_their_commands_print(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    page: str,
+    runs_before: list[str],
+    shown: list[str],
 ) -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / page).read_text(encoding="utf-8")
     found = re.findall(r"<!-- output: (.*?) -->\n```text\n(.*?)```", text, re.DOTALL)
     before = re.findall(r"<!-- before: (.*?) -->", text)
-    assert [command.split()[:2] for command in before] == [["copem-replay", "run"]]
-    assert [command.split()[0] for command, _ in found] == ["copem-replay", "python", "copem-replay"]
+    assert [" ".join(command.split()[:2]) for command in before] == runs_before
+    assert [" ".join(command.split()[:2]) for command, _ in found] == shown
     monkeypatch.chdir(ROOT)
 
     def printed(command: str) -> str:
@@ -59,8 +80,13 @@ def test_readme_shows_what_its_commands_print(
         assert printed(command) == expected
 
 
-def test_readme_experiment_loads(tmp_path: Path) -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_all_outputs_on_pages_are_tested() -> None:
+    marked = [page for page in PAGES if "<!-- output: " in page.read_text(encoding="utf-8")]
+    assert sorted(page.name for page in marked) == ["README.md", "which_fusion.md", "worked_example.md"]
+
+
+def test_experiments_on_the_page_load(tmp_path: Path) -> None:
+    text = (ROOT / "docs/experiment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"<!-- experiment -->\n```yaml\n(.*?)```", text, re.DOTALL)
     assert blocks
     for k, block in enumerate(blocks):
@@ -71,8 +97,8 @@ def test_readme_experiment_loads(tmp_path: Path) -> None:
         assert isinstance(experiment, Experiment)
 
 
-def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_python_of_the_experiment_page_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    text = (ROOT / "docs/experiment.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (tmp_path / "logs").symlink_to(ROOT / "logs")
     monkeypatch.chdir(tmp_path)
@@ -86,8 +112,8 @@ def test_readme_python_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     assert len(namespace["fused"]) > 0
 
 
-def test_readme_and_notebooks_use_the_public_api_alone() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_pages_and_notebooks_use_the_public_api_alone() -> None:
+    text = (ROOT / "docs/experiment.md").read_text(encoding="utf-8")
     code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]

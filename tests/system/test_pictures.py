@@ -1,4 +1,4 @@
-"""The pictures of the README: all there, small, and in the colours they were taken in."""
+"""The pictures of the README and the docs: all there, small, and in the colours they were taken in."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ sys.path.insert(0, str(ROOT / "tools"))
 from pictures import LARGEST_BYTES, PICTURES, as_png  # noqa: E402
 
 
-def test_the_readme_shows_every_picture_and_says_what_is_on_it() -> None:
-    shown = re.findall(r"!\[(.*?)\]\((.*?)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert {ROOT / target for _, target in shown} == set(PICTURES.iterdir())
-    assert all(len(words.split()) > 5 for words, _ in shown)
+def test_every_picture_is_shown_with_words_that_say_what_is_on_it() -> None:
+    shown = {}
+    for page in (ROOT / "README.md", *ROOT.glob("docs/*.md")):
+        for words, target in re.findall(r"!\[(.*?)\]\((.*?)\)", page.read_text(encoding="utf-8")):
+            shown[(page.parent / target).resolve()] = words
+    assert set(shown) == set(PICTURES.iterdir())
+    assert all(len(words.split()) > 5 for words in shown.values())
 
 
 @pytest.mark.parametrize("path", sorted(PICTURES.iterdir()), ids=lambda path: path.name)

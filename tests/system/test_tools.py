@@ -26,6 +26,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 import bench  # noqa: E402
 import bench_fusion  # noqa: E402
 import bench_long  # noqa: E402
+import bench_memory  # noqa: E402
 import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
@@ -39,6 +40,31 @@ def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
     # Of the pairs (positive, negative): .9 > .1, .9 > .5, .5 > .1, .5 = .5: 3.5 of 4
     score, positive = np.array([0.9, 0.5, 0.5, 0.1]), np.array([True, True, False, False])
     assert lidar_visibility.auc(score, positive) == pytest.approx(3.5 / 4)
+
+
+def test_bench_of_memory_remembers_all_that_the_crossing_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, few in (("LISTS", 20), ("OBJECTS", 2), ("RUNS", 2)):
+        monkeypatch.setattr(bench_memory, name, few)
+    assert all(number > 0 for number in bench_memory.numbers().values())
+    plain, found = problems(load(ROOT / "logs/crossing.yaml"))
+    assert plain is not None, found
+    lasting = bench_memory.remembering(plain)
+    assert all(pem.memory.keys() == {"detection", *(pem.asked() or ())} for pem in lasting.pems.values())
+    assert lasting.configurations == plain.configurations
+
+
+def test_the_table_of_the_page_about_memory_is_what_its_tool_prints() -> None:
+    """Exact and sampled; by hand .7^6, .7^11, … of 6, 11, … lists within a second."""
+    done = subprocess.run(
+        [sys.executable, "tools/memory_table.py"], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert done.stdout in (ROOT / "docs/perception-models.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:6]]
+    for rate_hz, fresh, sampled, held, held_sampled in (map(float, row) for row in rows):
+        assert fresh == pytest.approx(0.7 ** (rate_hz + 1), abs=6e-5)
+        assert sampled == pytest.approx(fresh, abs=0.02)
+        assert held == pytest.approx(0.7 * (np.exp(-1 / rate_hz) + 0.7 * -np.expm1(-1 / rate_hz)) ** rate_hz, abs=6e-5)
+        assert held_sampled == pytest.approx(held, abs=0.03)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared/data with recordings is not beside the project")

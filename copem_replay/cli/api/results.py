@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -83,8 +82,11 @@ def write_report(results: AnyResults, file: str | PathLike[str] | None = None, *
     return write(folder_of(results), None if file is None else Path(file), baseline=baseline)
 
 
-def view(results: AnyResults) -> None:
-    """Open the recordings of a results folder in the Rerun viewer, and wait until it ends.
+def view(results: AnyResults, *, web: bool = False) -> None:
+    """Open the recordings of a results folder in the Rerun viewer, just before the first onset, and wait until it ends.
+
+    `web`: serve viewer and recordings on a free port of 127.0.0.1 instead, print the address, and go on until
+    interrupted (Ctrl-C).
 
     Raises InputError: no such folder, or no `replay.rrd` in it; OutputError where the viewer does not open.
 
@@ -92,26 +94,35 @@ def view(results: AnyResults) -> None:
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: out/nowhere: no such folder
     """
-    import subprocess
-
     from copem_replay.results.read import check_format
+    from copem_replay.viewer.opening import open_viewer, recordings_of
 
     folder = folder_of(results)
-    place = folder.absolute()  # no name that looks like an option
-    patterns = ("replay.rrd", "replay/**/*.rrd", "replay_*.rrd", "replay_*/**/*.rrd")
-    files = [path for pattern in patterns for path in sorted(place.glob(pattern)) if path.is_file()]
+    files = recordings_of(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     check_format(folder)
     if not files:
         raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
-    # The module, not the script: it is there in every environment that has rerun-sdk, whatever the PATH.
-    code = subprocess.call([sys.executable, "-m", "rerun", *map(str, files)])
-    if code:
+    if web:
+        _serve(folder, files)
+    elif code := open_viewer(folder, files):
         raise OutputError(
-            f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, copy "
-            f"{files[0].name} to a desktop and open it there: rerun {files[0].name}"
+            f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, "
+            f"copem-replay view {folder} --web serves it for a browser"
         )
+
+
+def _serve(folder: Path, files: Sequence[Path]) -> None:
+    """Serve recordings for a browser until interrupted."""
+    from copem_replay.viewer.web import serve
+
+    try:
+        with serve(folder, files) as server:
+            print(f"viewer at {server.url} (Ctrl-C ends it)", flush=True)
+            server.serve_forever()
+    except KeyboardInterrupt:  # how it is meant to end
+        return
 
 
 def folder_of(results: AnyResults) -> Path:

@@ -17,6 +17,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES
+from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.run import Progress, Result
@@ -183,7 +184,8 @@ def fused_tracks(experiment: AnyExperiment, recording: Recording | AnyPath, run:
     study = study_of(experiment, recording)
     if not 0 <= run < study.experiment.runs:
         raise InputError(f"run: expected 0 … {study.experiment.runs - 1}, found {run}")
-    one = one_run(study.recordings[0], study.experiment, run)
+    read = study.recordings[0]
+    one = one_run(read, of_log(study.experiment, read.scene.log), run)
     return {name: replace(each, scene=one.replay.scene) for name, each in one.run_tracks.whole().items()}
 
 
@@ -202,7 +204,7 @@ def observations(experiment: AnyExperiment, recording: Recording | AnyPath) -> p
     from copem_replay.pipeline.prepare import prepare
 
     study = study_of(experiment, recording)
-    replay = prepare(study.recordings[0], study.experiment)
+    replay = prepare(study.recordings[0], of_log(study.experiment, study.recordings[0].scene.log))
     found, episodes = replay.measured, replay.episodes
     tracks, scene = found.tracks, replay.scene
     onset_s = pd.Series(episodes.onset_s, index=episodes.object_ix).reindex(tracks.row_object_ix).to_numpy()

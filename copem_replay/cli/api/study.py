@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.experiment.cross_references import NO_EGO, references
-from copem_replay.experiment.file import Source, load, log_paths, plain
+from copem_replay.experiment.drive import of_log
+from copem_replay.experiment.file import Source, entries_of, load, log_paths, plain, with_logs
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import across_logs, against_log, log_names, problems, read_logs
+from copem_replay.experiment.validate import across_logs, against_log, bound, log_names, problems, read_logs
 from copem_replay.io.recording import Recording
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
@@ -52,7 +53,7 @@ def load_experiment(experiment: AnyExperiment) -> Experiment:
     checked, found = _examined(source, given)
     if checked is None or found:
         raise ExperimentError(found)
-    return checked.model_copy(update={"logs": tuple(map(str, log_paths(source)[0]))})
+    return checked.model_copy(update={"logs": entries_of(checked, source)})
 
 
 def source_of(experiment: AnyExperiment) -> tuple[Source, Experiment | None]:
@@ -83,8 +84,7 @@ def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None)
     paths = tuple(str(Path(one.path if isinstance(one, Recording) else one)) for one in listed)
     if not paths:
         raise InputError("recordings: expected at least one, found none")
-    options = {**source.options, ("logs",): "recordings"}
-    source = replace(source, data=source.data | {"logs": list(paths)}, logs=paths, options=options)
+    source = with_logs(source, paths, "recordings")
     read = [one for one in listed if isinstance(one, Recording)]
     if not read:
         return read_study(source, given)
@@ -106,6 +106,7 @@ def read_study(source: Source, given: Experiment | None = None, *, skip_unreadab
     found += across_logs(experiment, recordings, source)
     if found:
         raise InputError(found)
+    experiment = bound(experiment, recordings, source)
     return Study(source, experiment, tuple(recordings), tuple((log.path, log.reason) for log in refused))
 
 
@@ -115,8 +116,9 @@ def _study_with(source: Source, given: Experiment | None, recordings: Sequence[R
     if experiment is None:
         raise ExperimentError(found)
     for recording in recordings:
-        found += _misread(experiment, recording)
-        found += [source.at(key, f"{recording.path}: {reason}") for key, reason in against_log(experiment, recording)]
+        alone = of_log(bound(experiment, [recording], source), recording.scene.log)
+        found += _misread(alone, recording)
+        found += [source.at(key, f"{recording.path}: {reason}") for key, reason in against_log(alone, recording)]
     found += across_logs(experiment, recordings, source)
     names = [recording.scene.log for recording in recordings]
     if len(set(names)) < len(names):
@@ -125,7 +127,8 @@ def _study_with(source: Source, given: Experiment | None, recordings: Sequence[R
     if found:
         raise InputError(found)
     named = (replace(r, scene=replace(r.scene, log=name)) for r, name in zip(recordings, names, strict=True))
-    return Study(source, experiment, tuple(named))
+    recordings = tuple(named)
+    return Study(source, bound(experiment, recordings, source), recordings)
 
 
 def _misread(experiment: Experiment, recording: Recording) -> Iterator[str]:
@@ -156,7 +159,7 @@ def prepared(study: Study) -> tuple[list[Replay], list[str]]:
     from copem_replay.pipeline.memory import memory_notes
     from copem_replay.pipeline.prepare import prepare
 
-    ready = [prepare(recording, study.experiment) for recording in study.recordings]
+    ready = [prepare(recording, of_log(study.experiment, recording.scene.log)) for recording in study.recordings]
     key: tuple[str, ...] = ("measure", "exact")
     try:
         if study.experiment.measure.exact:

@@ -19,9 +19,12 @@ _ROLES: Final[Mapping[Role, str]] = {
 }
 
 
-def describe(survey: Survey) -> list[str]:
-    """Say in lines of plain text what a look at a recording found. Why it found no truth is left to `reason`."""
-    lines: list[str] = [survey.recording, *_topic_lines(survey)]
+def describe(survey: Survey, width: int | None = None) -> list[str]:
+    """Say in lines of plain text what a look at a recording found. Why it found no truth is left to `reason`.
+
+    `width`: of the terminal; a table of topics that is wider has two lines per topic.
+    """
+    lines: list[str] = [survey.recording, *_topic_lines(survey, width)]
     for truth in survey.truth:
         lines += _truth_lines(truth)
     lines += [survey.choice] if survey.choice else []
@@ -34,7 +37,7 @@ def describe(survey: Survey) -> list[str]:
     return [printable(line) for line in lines]
 
 
-def _topic_lines(survey: Survey) -> list[str]:
+def _topic_lines(survey: Survey, width: int | None) -> list[str]:
     """Tabulate the topics."""
     rows = [("topic", "schema", "encoding", "messages", "")]
     rows += [
@@ -49,6 +52,8 @@ def _topic_lines(survey: Survey) -> list[str]:
     ]
     a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))
     table = [f"  {w:<{a}}  {x:<{b}}  {y:<{c}}  {z:>{d}}  {role}".rstrip() for w, x, y, z, role in rows]
+    if width is not None and max(map(len, table)) > width:
+        table = [line for row in rows for line in (f"  {row[0]}", f"      {'  '.join(filter(None, row[1:]))}")]
     return table if survey.topics else []
 
 

@@ -34,3 +34,27 @@ def filled(data: bytes, size: int = 4) -> bytes:
 def string_message(value: str) -> bytes:
     """std_msgs/String."""
     return HEAD + text(value)
+
+
+class Cdr:
+    """A message that grows field by field, each aligned to its own size."""
+
+    def __init__(self) -> None:
+        self._body = bytearray()
+
+    def add(self, kind: str, *values: float) -> None:
+        """Numbers of a kind of `struct`: `B`, `I`, `i` or `d`."""
+        size = struct.calcsize(kind)
+        self._body += bytes(-len(self._body) % size) + struct.pack(f"<{len(values)}{kind}", *values)
+
+    def text(self, value: str) -> None:
+        """A string."""
+        self._body += bytes(-len(self._body) % 4) + text(value)
+
+    def stamp(self, time_ns: int) -> None:
+        """A time."""
+        self._body += bytes(-len(self._body) % 4) + stamp(time_ns)
+
+    def message(self) -> bytes:
+        """All of it."""
+        return HEAD + bytes(self._body)

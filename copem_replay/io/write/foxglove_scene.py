@@ -6,6 +6,8 @@ and nothing piles up (entities replace by id and live until deleted).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ import numpy as np
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Scene
+from copem_replay.io.write.drawing import Entity, Pose
 
 SCHEMA = "foxglove.SceneUpdate"
 FRAME_ID = "global"
@@ -83,3 +86,56 @@ def _prototype(name: str, said: dict[str, str], colour: Rgb, frame_id: str) -> A
     color.r, color.g, color.b = (c / 255 for c in colour)
     color.a = ALPHA
     return entity
+
+
+def drawn(entities: Sequence[Entity], time_ns: int, frame_id: str) -> bytes:
+    """A message that deletes all that was on its topic, and draws entities."""
+    from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+
+    update = message_class()()
+    deletion = update.deletions.add()
+    deletion.type = SceneEntityDeletion.ALL
+    deletion.timestamp.FromNanoseconds(time_ns)
+    for each in entities:
+        entity = update.entities.add(frame_id=frame_id, id=each.name)
+        entity.timestamp.CopyFrom(deletion.timestamp)
+        for key, value in each.says.items():
+            entity.metadata.add(key=key, value=value)
+        for ellipse in each.ellipses:
+            made = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+            made.size.x, made.size.y, made.size.z = ellipse.size
+            _placed(made, ellipse.pose, ellipse.colour)
+        for line in each.lines:
+            made = entity.lines.add(thickness=line.width, scale_invariant=True)
+            for x, y, z in line.points:
+                made.points.add(x=x, y=y, z=z)
+            _placed(made, line.pose, line.colour)
+        for text in each.texts:
+            made = entity.texts.add(billboard=True, font_size=text.size, scale_invariant=True, text=text.text)
+            _placed(made, text.pose, text.colour)
+    encoded: bytes = update.SerializeToString(deterministic=True)
+    return encoded
+
+
+def transform_class() -> Any:
+    """The FrameTransform class, imported when first needed."""
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+
+    return FrameTransform
+
+
+def transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
+    """Where the frame `child` is in the frame `parent`."""
+    made = transform_class()(parent_frame_id=parent, child_frame_id=child)
+    made.timestamp.FromNanoseconds(time_ns)
+    made.translation.x, made.translation.y, made.translation.z = pose.x_m, pose.y_m, pose.z_m
+    made.rotation.z, made.rotation.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+    encoded: bytes = made.SerializeToString(deterministic=True)
+    return encoded
+
+
+def _placed(primitive: Any, pose: Pose, colour: tuple[float, float, float, float]) -> None:
+    at, turn, color = primitive.pose.position, primitive.pose.orientation, primitive.color
+    at.x, at.y, at.z = pose.x_m, pose.y_m, pose.z_m
+    turn.z, turn.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+    color.r, color.g, color.b, color.a = colour

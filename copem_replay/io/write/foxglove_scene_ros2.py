@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Scene
 from copem_replay.io.write import cdr_writer as cdr
+from copem_replay.io.write.drawing import Entity, Pose, Rgba
 from copem_replay.io.write.foxglove_scene import ALPHA, metadata
 from copem_replay.io.write.ros2_definitions import SCENE_UPDATE as SCHEMA
 
-__all__ = ["SCHEMA", "SceneWriter"]
+__all__ = ["SCHEMA", "SceneWriter", "drawn", "transform"]
 
 _ALL = 1  # SceneEntityDeletion.type
 _FOREVER = bytes(8)  # lifetime
@@ -69,3 +73,66 @@ def _entity(name: str, said: dict[str, str], frame_id: str) -> bytes:
     texts = [cdr.filled(cdr.text(each)) for pair in said.items() for each in pair]
     head = cdr.filled(cdr.text(frame_id)) + cdr.filled(cdr.text(name)) + _FOREVER + _UNLOCKED
     return head + cdr.number(len(said)) + b"".join(texts) + cdr.number(0) + cdr.number(1)
+
+
+def drawn(entities: Sequence[Entity], time_ns: int, frame_id: str) -> bytes:
+    """A message that deletes all that was on its topic, and draws entities."""
+    out = cdr.Cdr()
+    out.add("I", 1)
+    out.stamp(time_ns)
+    out.add("B", _ALL)
+    out.text("")
+    out.add("I", len(entities))
+    for each in entities:
+        out.stamp(time_ns)
+        out.text(frame_id)
+        out.text(each.name)
+        out.add("I", 0, 0)  # lifetime
+        out.add("B", 0)  # frame_locked
+        out.add("I", len(each.says))
+        for pair in each.says.items():
+            for text in pair:
+                out.text(text)
+        out.add("I", 0, 0, 0, len(each.ellipses))  # arrows, cubes, spheres, cylinders
+        for ellipse in each.ellipses:
+            _pose(out, ellipse.pose)
+            out.add("d", *ellipse.size, 1.0, 1.0, *ellipse.colour)
+        out.add("I", len(each.lines))
+        for line in each.lines:
+            _line(out, line.points, line.width, line.pose, line.colour)
+        out.add("I", 0, len(each.texts))  # triangles, texts
+        for words in each.texts:
+            _pose(out, words.pose)
+            out.add("B", 1)  # billboard
+            out.add("d", words.size)
+            out.add("B", 1)  # scale_invariant
+            out.add("d", *words.colour)
+            out.text(words.text)
+        out.add("I", 0)  # models
+    return out.message()
+
+
+def transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
+    """Where the frame `child` is in the frame `parent`: foxglove_msgs/FrameTransform."""
+    out = cdr.Cdr()
+    out.stamp(time_ns)
+    out.text(parent)
+    out.text(child)
+    _pose(out, pose)
+    return out.message()
+
+
+def _line(out: cdr.Cdr, points: Sequence[tuple[float, float, float]], width: float, pose: Pose, colour: Rgba) -> None:
+    out.add("B", 0)  # LINE_STRIP
+    _pose(out, pose)
+    out.add("d", width)
+    out.add("B", 1)  # scale_invariant
+    out.add("I", len(points))
+    for point in points:
+        out.add("d", *point)
+    out.add("d", *colour)
+    out.add("I", 0, 0)  # colors, indices
+
+
+def _pose(out: cdr.Cdr, pose: Pose) -> None:
+    out.add("d", pose.x_m, pose.y_m, pose.z_m, 0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))

@@ -2,8 +2,10 @@
 
 For each configuration three channels: `copem/<configuration>/objects` (the fused lists), `…/scene` (the same as
 boxes) and `…/detail` (JSON: what the objects cannot carry), in messages of the input's family
-(`io/write/message_family.py`), one per fused list, log_time = publish_time = the instant it was available. The same
-input gives the same bytes; the file appears under its name when it is complete, or not at all.
+(`io/write/message_family.py`), one per fused list, log_time = publish_time = the instant it was available. Two more are
+for looking at: `…/status` (what is known) and `…/uncertainty` (ellipses, paler with age). The truth is a scene of its
+own: `copem/truth/scene` (what moves), `…/static` (what does not) and `…/transform` (the ego's frame of reference). The
+same input gives the same bytes; the file appears under its name when it is complete, or not at all.
 """
 
 from __future__ import annotations
@@ -23,12 +25,25 @@ from mcap.writer import Writer
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_NS, Scene, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Scene, Tracks
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
-from copem_replay.io.write.message_family import OSI_CHANNEL, Family, ListWriter, Opened, Osi, osi_version, topics_of
+from copem_replay.io.write.drawing import TruthScene
+from copem_replay.io.write.message_family import (
+    OSI_CHANNEL,
+    TRUTH_TOPICS,
+    Family,
+    ListWriter,
+    Opened,
+    Osi,
+    TruthWriter,
+    more_topics_of,
+    osi_version,
+    topics_of,
+)
 from copem_replay.io.write.pass_through import Catalogue
 from copem_replay.io.write.source import Source, source_of
+from copem_replay.io.write.status import Statuses
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
@@ -47,6 +62,7 @@ def write_mcap(
     manifest: Mapping[str, str],
     family: Family | None = None,
     window: Window | None = None,
+    truth: TruthScene | None = None,
 ) -> list[str]:
     """Write `source` with the fused lists of one run added.
 
@@ -54,7 +70,8 @@ def write_mcap(
 
     `table`: the rows of the detections table of this log and run, by which detections are told beside the lists.
     `manifest`: what made the file, kept as a metadata record. `family`: in what messages, None: OSI's.
-    `window`: of `source` that was read, None: all.
+    `window`: of `source` that was read, None: all. `truth`: to be drawn beside them, None: not drawn; nor where a
+    configuration has the name of its topics.
 
     Returns notes on what could not be copied, or was replaced.
 
@@ -69,16 +86,21 @@ def write_mcap(
     numbers = {unit: k + 1 for k, unit in enumerate(units)}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)
-        ours = {topic for name in first for topic in topics_of(name)}
+        ours = {topic for name in first for topic in (*topics_of(name), *more_topics_of(name))} | {*TRUTH_TOPICS}
         messages = original.messages(original.register(catalogue, without=ours))
         opened = family.open(catalogue, scene, numbers)
 
         def lists_of(chunk: Mapping[str, FusedTracks]) -> list[Iterator[Message]]:
             return list(_lists_of(opened, scene, chunk, table, colours))
 
-        begun = lists_of(first)  # registers the channels
+        def besides(chunk: Mapping[str, FusedTracks]) -> list[Iterator[Message]]:
+            return list(_besides(opened, scene, chunk, table, colours))
+
+        begun = [*lists_of(first), *besides(first)]  # registers the channels, those of the lists first
+        shown = [] if truth is None or TRUTH in first else [_truth(opened.truth(), truth)]
         del first
-        added = chain.from_iterable(_in_order(streams) for streams in chain([begun], (lists_of(c) for c in rest)))
+        chunks = chain([begun], ([*lists_of(c), *besides(c)] for c in rest))
+        added = _in_order([chain.from_iterable(_in_order(streams) for streams in chunks), *shown])
         _add_records(writer, original, family, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for message in _in_order([messages, added]):
             writer.add_message(
@@ -106,6 +128,27 @@ def _lists_of(
     for name, fused_tracks in chunk.items():
         events = _events(fused_tracks.fused, table[table["configuration"] == name])
         yield _lists(scene, fused_tracks.fused, opened.channels(name, fused_tracks, events, colours[name]))
+
+
+def _besides(
+    opened: Opened, scene: Scene, chunk: Mapping[str, FusedTracks], table: pd.DataFrame, colours: Mapping[str, Rgb]
+) -> Iterator[Iterator[Message]]:
+    """Of each configuration what is only for looking at, of one time chunk."""
+    for name, fused_tracks in chunk.items():
+        statuses = Statuses(scene, fused_tracks, table[table["configuration"] == name])
+        yield _lists(scene, fused_tracks.fused, opened.seen_besides(name, fused_tracks, statuses, colours[name]))
+
+
+def _truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
+    """The truth as a scene of its own: what does not move once, at the start."""
+    for k, frame in enumerate(truth.frames):
+        time_ns = frame.time_ns
+        if k == 0:
+            yield Message(writer.static, time_ns, writer.drawn(truth.static, time_ns), time_ns, 0)
+        yield Message(writer.scene, time_ns, writer.drawn(frame.entities, time_ns), time_ns, 0)
+        if frame.followed is not None:
+            placed = writer.followed(frame.followed, time_ns, truth.follow)
+            yield Message(writer.transform, time_ns, placed, time_ns, 0)
 
 
 def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:

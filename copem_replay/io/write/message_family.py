@@ -7,13 +7,16 @@ only, for a file of the profile `ros2` holds nothing else.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from typing import Any, Protocol
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import Scene
+from copem_replay.core.tracks import TRUTH, Scene
 from copem_replay.io.recording import Recording
 from copem_replay.io.write import (
     autoware_objects as detected_objects,
@@ -33,8 +36,13 @@ from copem_replay.io.write import (
 from copem_replay.io.write import (
     osi_sensor_data as sensor_data,
 )
+from copem_replay.io.write.drawing import Entity, Pose
 from copem_replay.io.write.pass_through import Catalogue
-from copem_replay.io.write.ros2_definitions import STRING, definition
+from copem_replay.io.write.ros2_definitions import STATUS, STRING, TRANSFORM, definition
+from copem_replay.io.write.status import JSON_SCHEMA as STATUS_JSON
+from copem_replay.io.write.status import SCHEMA as STATUS_SCHEMA
+from copem_replay.io.write.status import Statuses, StatusWriter
+from copem_replay.io.write.uncertainty import UncertaintyWriter
 
 OSI_CHANNEL = "net.asam.osi.trace.channel."
 _NAMELESS = "map"  # chosen: what the world is called where nobody says it, as REP 105 has it
@@ -62,6 +70,25 @@ class Opened(Protocol):
     ) -> dict[int, ListWriter]:
         """The channels of a configuration: `objects`, `scene`, `detail`, in this order."""
 
+    def seen_besides(
+        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
+    ) -> dict[int, ListWriter]:
+        """The channels of a configuration that are only for looking at: `status`, `uncertainty`."""
+
+    def truth(self) -> TruthWriter:
+        """What puts the truth into the file as a scene of its own."""
+
+
+@dataclass(frozen=True)
+class TruthWriter:
+    """The channels of the truth, and how its scenes and the frame to follow become messages of the family."""
+
+    scene: int
+    static: int
+    transform: int
+    drawn: Callable[[Sequence[Entity], int], bytes]
+    followed: Callable[[Pose, int, str], bytes]
+
 
 class Family(Protocol):
     """A family, chosen."""
@@ -83,6 +110,17 @@ def family_of(recording: Recording) -> Family:
 def topics_of(configuration: str) -> list[str]:
     """The topics of a configuration, whatever the family."""
     return [f"copem/{configuration}/{kind}" for kind in ("objects", "scene", "detail")]
+
+
+def more_topics_of(configuration: str) -> list[str]:
+    """Its topics that are only for looking at."""
+    return [f"copem/{configuration}/{kind}" for kind in ("status", "uncertainty")]
+
+
+TRUTH_TOPICS = [f"copem/{TRUTH}/{kind}" for kind in ("scene", "static", "transform")]
+"""The truth as a scene of its own: what moves, what does not, where the ego is."""
+EGO_FRAME, MIDDLE_FRAME = "copem_ego", "copem_middle"
+"""Frames of reference to follow: one moves with the ego, the other, without an ego, stands amid all objects."""
 
 
 def osi_version() -> str:
@@ -130,6 +168,28 @@ class _OpenedOsi:
             channel(details, "json", self._details, {}): detail.DetailWriter(scene, fused_tracks, events),
         }
 
+    def seen_besides(
+        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
+    ) -> dict[int, ListWriter]:
+        catalogue, (status, uncertainty) = self._catalogue, more_topics_of(name)
+        said = catalogue.schema(STATUS_SCHEMA, "jsonschema", json.dumps(STATUS_JSON).encode())
+        return {
+            catalogue.channel(status, "json", said, {}): StatusWriter(statuses),
+            catalogue.channel(uncertainty, "protobuf", self._scenes, {}): UncertaintyWriter(
+                self._scene, fused_tracks, colour, self.drawn
+            ),
+        }
+
+    def truth(self) -> TruthWriter:
+        moves = _protobuf(self._catalogue, foxglove.transform_class(), "foxglove.FrameTransform")
+        schemas = zip(TRUTH_TOPICS, (self._scenes, self._scenes, moves), strict=True)
+        scene, static, ego = (self._catalogue.channel(topic, "protobuf", schema, {}) for topic, schema in schemas)
+        placed = partial(foxglove.transform, self._frame_id)
+        return TruthWriter(scene, static, ego, self.drawn, placed)
+
+    def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
+        return foxglove.drawn(entities, time_ns, self._frame_id)
+
 
 class Ros2:
     """autoware_perception_msgs/DetectedObjects and foxglove_msgs/SceneUpdate in the frame of reference `frame_id`; the
@@ -170,6 +230,45 @@ class _OpenedRos2:
             for topic, schema in zip(topics_of(name), self._schemas, strict=True)
         ]
         return dict(zip(numbers, writers, strict=True))
+
+    def seen_besides(
+        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
+    ) -> dict[int, ListWriter]:
+        schemas = self._catalogue.schema(STATUS, "ros2msg", definition(STATUS)), self._schemas[1]
+        numbers = [self._channel(topic, schema) for topic, schema in zip(more_topics_of(name), schemas, strict=True)]
+        uncertainty = UncertaintyWriter(self._scene, fused_tracks, colour, self.drawn)
+        return dict(zip(numbers, (_AsStatus(statuses), uncertainty), strict=True))
+
+    def truth(self) -> TruthWriter:
+        moves = self._catalogue.schema(TRANSFORM, "ros2msg", definition(TRANSFORM))
+        schemas = zip(TRUTH_TOPICS, (self._schemas[1], self._schemas[1], moves), strict=True)
+        scene, static, ego = (self._channel(topic, schema) for topic, schema in schemas)
+        placed = partial(foxglove_ros2.transform, self._frame_id)
+        return TruthWriter(scene, static, ego, self.drawn, placed)
+
+    def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
+        return foxglove_ros2.drawn(entities, time_ns, self._frame_id)
+
+    def _channel(self, topic: str, schema: int) -> int:
+        return self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
+
+
+class _AsStatus:
+    """Statuses as copem_replay_msgs/Status."""
+
+    def __init__(self, statuses: Statuses) -> None:
+        self._statuses = statuses
+
+    def message(self, frame: int, available_ns: int) -> bytes:
+        out = cdr_write.Cdr()
+        out.stamp(available_ns)
+        found = list(self._statuses.at(frame, available_ns))
+        out.add("I", len(found))
+        for name, status, age_s in found:
+            out.text(name)
+            out.text(status)
+            out.add("d", math.nan if age_s is None else age_s)
+        return out.message()
 
 
 class _AsString:

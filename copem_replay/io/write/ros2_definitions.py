@@ -9,6 +9,8 @@ from __future__ import annotations
 DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
 SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
 STRING = "std_msgs/msg/String"
+TRANSFORM = "foxglove_msgs/msg/FrameTransform"
+STATUS = "copem_replay_msgs/msg/Status"
 
 _COLOURED = "foxglove_msgs/Color color"
 _MESHED = (f"{_COLOURED}", "foxglove_msgs/Color[] colors", "uint32[] indices")
@@ -101,6 +103,15 @@ _FIELDS: dict[str, tuple[str, ...]] = {
         "foxglove_msgs/TextPrimitive[] texts",
         "foxglove_msgs/ModelPrimitive[] models",
     ),
+    "foxglove_msgs/FrameTransform": (
+        "builtin_interfaces/Time timestamp",
+        "string parent_frame_id",
+        "string child_frame_id",
+        "geometry_msgs/Vector3 translation",
+        "geometry_msgs/Quaternion rotation",
+    ),
+    "copem_replay_msgs/Status": ("builtin_interfaces/Time stamp", "copem_replay_msgs/ObjectStatus[] objects"),
+    "copem_replay_msgs/ObjectStatus": ("string id", "string status", "float64 age_s"),
     "foxglove_msgs/Color": ("float64 r", "float64 g", "float64 b", "float64 a"),
     "foxglove_msgs/KeyValuePair": ("string key", "string value"),
     "foxglove_msgs/ArrowPrimitive": (

@@ -163,6 +163,9 @@ def _points(
             outline = {"color": look.edge, "s": (size**0.5 + 1.2) ** 2, "label": "_outline"}
             axes.scatter(distance_m[chosen], across[chosen], zorder=1.9, **(points | outline))
             points["alpha"] = 1.0
+        if verdict == FAIL and points["rasterized"]:  # black in a picture, which stays so on a dark page
+            halo = {"color": "white", "linewidths": 2.4, "label": "_halo", "zorder": 1.95}
+            axes.scatter(distance_m[chosen], across[chosen], **(points | halo))
         label = f"{name}: {verdict}"
         axes.scatter(distance_m[chosen], across[chosen], label=label, zorder=2, **({"alpha": alpha} | points))
 

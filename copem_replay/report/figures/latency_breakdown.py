@@ -49,12 +49,12 @@ STAGES = {
     "different latencies, or recorded ones",
 }
 HATCHES = {
-    HIDDEN: ("#d9d9d9", "", "black"),
-    IN_SIGHT: ("#8c8c8c", "///", "white"),
-    UNTIL_CAPTURED: ("white", "///", "#8c8c8c"),
-    TRANSPORT: ("#404040", "", "black"),
-    FUSION: ("white", "...", "black"),
-    SINCE_CAPTURED: ("#6e6e6e", "xxx", "white"),
+    HIDDEN: ("#d9d9d9", "", "#000000"),
+    IN_SIGHT: ("#8c8c8c", "///", "#ffffff"),
+    UNTIL_CAPTURED: ("#ffffff", "///", "#8c8c8c"),
+    TRANSPORT: ("#404040", "", "#000000"),
+    FUSION: ("#ffffff", "...", "#000000"),
+    SINCE_CAPTURED: ("#6e6e6e", "xxx", "#ffffff"),
 }
 """Of each stage its fill, and the hatch on it with its colour."""
 

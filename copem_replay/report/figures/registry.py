@@ -85,7 +85,7 @@ def _no_trade_off(results: Results, selection: Selection) -> str | None:
 def _trade_off_about(results: Results) -> Sequence[str]:
     return (
         "A false positive is an entry of a fused list at no object. A fusion that keeps more entries detects sooner, "
-        "and keeps more false positives; times at equal rates are in the table of differences.",
+        "and keeps more false positives.",
     )
 
 

@@ -177,8 +177,8 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def add_note(figure: Figure, sentences: Sequence[str]) -> None:
-    """Write what the figure shows below it, in small print, and keep that place free."""
+def add_note(figure: Figure, sentences: Sequence[str]) -> float:
+    """Write what the figure shows below it, in small print, and keep that place free. Returns its height in inches."""
     import re
     import textwrap
 
@@ -186,8 +186,10 @@ def add_note(figure: Figure, sentences: Sequence[str]) -> None:
     per_line = int((width_in - 0.2) * 72 / (NOTE_PT * 0.56))  # a letter is 0.56 of the size wide, on the average
     text = ". ".join(sentence.rstrip(".") for sentence in sentences if sentence) + "."
     lines = textwrap.wrap(re.sub(r"(?<=\d) (?=%|[ms]\b)", "\u00a0", text), per_line)
-    below = (len(lines) * NOTE_PT * 1.3 / 72 + 0.12) / height_in
+    below_in = len(lines) * NOTE_PT * 1.3 / 72 + 0.12
+    below = below_in / height_in
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.set(rect=(0, below, 1, 1 - below))  # type: ignore[call-arg]
     figure.text(0.1 / width_in, 0.06 / height_in, "\n".join(lines), fontsize=NOTE_PT, color="0.3", va="bottom")
+    return below_in

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,13 +14,15 @@ from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 from copem_replay.report.figures.captions import per_cent, plain
 from copem_replay.report.figures.contenders import RANKED_BY
 from copem_replay.report.html.headers import signed_difference
-from copem_replay.report.html.markup import Html, joined, listed, tag
+from copem_replay.report.html.markup import Html, joined, listed, tag, text
 from copem_replay.report.html.setup import some, together
 from copem_replay.report.html.study import Study
 from copem_replay.report.html.ties import as_soon_as_the_best, at_once, why_no_interval
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.tables import NOTHING
+
+_INTERVAL = re.compile(r"(?:[^\s(]+ (?:s|%|percentage points) )?\[[^\[\]<]*\]")
 
 
 def lead(study: Study) -> Html:
@@ -34,7 +37,12 @@ def more(study: Study) -> Html:
     if study.best is None:
         return listed(str(note) for note in study.provenance.get("notes", []))
     _, *others = _sentences(study)
-    return listed(others)
+    return listed(map(_held_together, others))
+
+
+def _held_together(sentence: str) -> Html:
+    """No line breaks between a value and its interval, nor within."""
+    return Html(_INTERVAL.sub(lambda found: tag("span", Html(found[0]), class_="tight"), text(sentence)))
 
 
 def _sentences(study: Study) -> Iterator[str]:
@@ -70,12 +78,17 @@ def _soonest(study: Study) -> Html:
     same = as_soon_as_the_best(study)
     if len(same) == 1:
         return _first(study, name, mean_s, counted_as)
-    unsure = _told_apart(study.lead)[3]
+    _, alike, sooner, unsure = _told_apart(study.lead)
     when = "every object at its onset"
     if not at_once(study):
         when = f"at the same times: after {plain(mean_s)} s on average{counted_as}"
     rest = len(study.lead.configurations) + 1 - len(same)
-    whom = f" The other {rest} are below." if rest > 1 else " The other is below." if rest else ""
+    undecided = sum(name not in same for rows in (alike, sooner) for name in rows["configuration"])
+    others = f"the other {rest}" if rest > 1 else "the other"
+    whom = f" {others[:1].upper()}{others[1:]} {'are' if rest > 1 else 'is'} below." if rest else ""
+    if undecided:
+        to = others if undecided == rest else f"{undecided} of {others}"
+        whom = f" The interval of their difference to {to} includes 0."
     return joined([_missing(study, unsure), tag("b", together(same)), f" detect {when}.{whom}"])
 
 

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import re
 
-_GREY = re.compile(r"(?<=[: ])#([0-9a-f]{2})\1\1\b")
+_GREY = re.compile(r"(?<=[: \"])#([0-9a-f]{2})\1\1\b")
 _USED = re.compile(r"var\(--g-([0-9a-f]{2})\)")
 INK, PAPER = (232, 232, 232), (27, 27, 27)
 """Of the dark page (`page.css` has the same)."""
 
 
 def as_variables(svg: str) -> str:
-    """`fill: #262626` as `fill: var(--g-26)`; black, where nothing says a colour, is the page's ink by its style."""
+    """`#262626` as `var(--g-26)`, in styles and attributes; what has no colour is of the ink that `page.css` says."""
     return _GREY.sub(r"var(--g-\1)", svg)
 
 

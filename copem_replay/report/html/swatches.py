@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copem_replay.report.figures.style import Appearance, Colour
+from copem_replay.report.html.greys import as_variables
 from copem_replay.report.html.markup import Html, tag
 
 _PX = 1.25
@@ -37,8 +38,8 @@ def swatch(look: Appearance) -> Html:
     return tag("svg", *edge, line(look.colour, width), class_="swatch", viewBox="0 0 44 14", aria_hidden="true")
 
 
-def box(fill: str, marks: str = "", colour: str = "black") -> Html:
-    """A piece of a bar, for keys: filled, with `marks` on it, a path in a square of 14."""
+def box(fill: str, marks: str = "", colour: str = "#000000") -> Html:
+    """A piece of a bar, for keys: filled, with `marks` on it, a path in a square of 14. Greys go by the page."""
     shape = tag("rect", x="0.5", y="0.5", width="13", height="13", fill=fill, stroke="#404040")
     drawn = [tag("path", d=marks, stroke=colour, stroke_width="1.6", fill="none")] if marks else []
-    return tag("svg", shape, *drawn, class_="box", viewBox="0 0 14 14", aria_hidden="true")
+    return Html(as_variables(tag("svg", shape, *drawn, class_="box", viewBox="0 0 14 14", aria_hidden="true")))

@@ -175,7 +175,7 @@ def regret_table(study: Study) -> Html:
             folded(
                 "What the columns mean, and how they are made",
                 _meanings(words, difference_header),
-                listed(_sentence(line) for line in comparison_lines(regret)),
+                listed(_sentence(line) for line in comparison_lines(regret) if not line.startswith("*")),
             ),
         ]
     )

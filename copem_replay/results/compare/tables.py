@@ -11,7 +11,7 @@ import pandas as pd
 
 from copem_replay.core.errors import OutputError
 from copem_replay.core.files import atomic_file
-from copem_replay.core.text import printable
+from copem_replay.core.text import printable, wrapped
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.summary_text import as_text
 from copem_replay.results.compare.limits import ALL_ALIKE
@@ -24,13 +24,16 @@ _SUFFIXES = (".csv", ".md")
 _RESULTS = ("summary.csv", "sweep.csv", "bands.csv")
 NOTHING = 1e-9
 """Closer to 0 than this is 0 (chosen: below what any of the metrics is measured with)."""
+APART = "*"
+"""Marks a difference whose interval excludes 0."""
 _WITHOUT = {ALL_ALIKE: "all alike", NOTHING_DRAWN: NOTHING_DRAWN}
 """How it is said in a cell that there is no interval, and why."""
 
 
-def comparison_text(comparison: Comparison) -> str:
-    """A row per configuration, a column per metric, and what they are; for a terminal or a pipe."""
-    return "\n".join([as_text(_cells(comparison)), *comparison_lines(comparison)])
+def comparison_text(comparison: Comparison, width: int | None = None) -> str:
+    """A row per configuration, a column per metric, and what they are; for a terminal of a width, or a pipe."""
+    lines = (part for line in comparison_lines(comparison) for part in wrapped(line, width))
+    return "\n".join([as_text(_cells(comparison), width), *lines])
 
 
 def comparison_markdown(comparison: Comparison) -> str:
@@ -72,13 +75,18 @@ def _cells(comparison: Comparison) -> pd.DataFrame:
 
 
 def _cell(row: Any) -> str:
-    """`+0.12 [0.05, 0.2]`; `+0.12 (all alike)`; a dash where there is no difference."""
+    """`+0.12 [0.05, 0.2] *`; `+0.12 (all alike)`; a dash where there is no difference."""
     if row is None or pd.isna(row.difference):
         return "–"
     if pd.isna(row.interval_over):
         return " ".join([signed(row.difference), *(f"({why})" for why in without_interval(row))])
     low, high = ("–" if pd.isna(limit) else plain(limit) for limit in (row.low, row.high))
-    return f"{signed(row.difference)} [{low}, {high}]"
+    return f"{signed(row.difference)} [{low}, {high}]{f' {APART}' if _excludes_0(row.low, row.high) else ''}"
+
+
+def _excludes_0(low: float, high: float) -> bool:
+    """Whether an interval tells a difference from none."""
+    return bool(low > NOTHING or high < -NOTHING)
 
 
 def without_interval(row: Any) -> list[str]:
@@ -105,6 +113,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     kinds = [kind if len(over) == 1 else f"{kind} ({', '.join(metrics)})" for kind, metrics in over.items()]
     if kinds:
         yield f"[95 %]: bootstrap interval over {'; '.join(kinds)}"
+    if any(_excludes_0(low, high) for low, high in zip(overall["low"], overall["high"], strict=True)):
+        yield f"{APART}: the interval excludes 0"
     yield from _on_intervals(overall)
     yield (
         f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that, who "

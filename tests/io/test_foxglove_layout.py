@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 
+from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.io.write.foxglove_layout import _split, layout_of
 from copem_replay.pipeline.run import run
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS
 from tests.io.test_write_ros2 import EXPERIMENT, drive
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
-
-from foxglove_layout import _split, layout_of  # noqa: E402
-
 KEPT = ROOT / "logs/tc016d.foxglove.json"
 
 
@@ -53,48 +49,73 @@ def leaves(part: Any) -> list[tuple[str, float, float]]:
     return sides
 
 
-def test_a_panel_for_every_scene(replay: Path) -> None:
-    layout = layout_of(replay)
+def topics_in(replay: Path) -> set[str]:
     with replay.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
-    scenes = {c.topic for c in summary.channels.values() if summary.schemas[c.schema_id].name == "foxglove.SceneUpdate"}
-    assert len(scenes) == 6
-    panels = layout["configById"]
-    assert all(panel.startswith("3D!") for panel in panels)
-    seen = {}
-    for panel, config in panels.items():
-        assert set(config["topics"]) == scenes, "what it names is there, and what it does not show is switched off"
-        (topic,) = (topic for topic, says in config["topics"].items() if says["visible"])
-        assert topic == f"copem/{config['foxglovePanelTitle']}/scene"
-        assert config["foxglovePanelTitle"] == config["lichtblickPanelTitle"]
-        assert config["followTf"] == "global", "the frame of reference of the scenes"
+    return {c.topic for c in summary.channels.values()}
+
+
+def panels_of(layout: dict[str, Any], kind: str) -> dict[str, Any]:
+    return {panel: config for panel, config in layout["configById"].items() if panel.startswith(kind)}
+
+
+NAMES = ["GT", "PEM", "coPEM:0s", "coPEM:0.5s", "coPEM:1s", "coPEM:1.5s"]
+
+
+def test_a_panel_for_every_scene(replay: Path) -> None:
+    layout = layout_of(replay)
+    scenes = panels_of(layout, "3D!")
+    assert [config["foxglovePanelTitle"] for config in scenes.values()] == NAMES, "in the order of the experiment"
+    for config in scenes.values():
+        name = config["foxglovePanelTitle"]
+        assert name == config["lichtblickPanelTitle"]
+        assert set(config["topics"]) <= topics_in(replay)
+        shown = {topic for topic, says in config["topics"].items() if says["visible"]}
+        own = {f"copem/{name}/scene", f"copem/{name}/uncertainty"}
+        assert shown == {"copem/truth/scene", "copem/truth/static"} | own
+        assert (config["followTf"], config["followMode"]) == ("copem_ego", "follow-position")
         assert config["scene"]["syncCamera"] is True
-        seen[topic] = panel
-    assert set(seen) == scenes
     placed = leaves(layout["layout"])
-    assert sorted(panel for panel, *_ in placed) == sorted(panels)
-    for _, wide, high in placed:
-        assert (wide, high) == pytest.approx((1 / 3, 1 / 2), abs=1e-4)
-    # In the order of the experiment, row by row.
-    titles = [panels[panel]["foxglovePanelTitle"] for panel, *_ in placed]
-    assert titles == ["GT", "PEM", "coPEM:0s", "coPEM:0.5s", "coPEM:1s", "coPEM:1.5s"]
+    assert sorted(panel for panel, *_ in placed) == sorted(layout["configById"])
+    for panel, wide, high in placed:
+        expected = (1 / 3, 0.72 / 2) if panel.startswith("3D!") else (1 / 2, 0.28)
+        assert (wide, high) == pytest.approx(expected, abs=1e-4)
 
 
-def test_the_sample_layout_is_what_the_tool_makes(replay: Path, tmp_path: Path) -> None:
+def test_lanes_and_curves_name_what_is_in_the_statuses(replay: Path) -> None:
+    layout = layout_of(replay)
+    (lanes,) = panels_of(layout, "StateTransitions!").values()
+    (curves,) = panels_of(layout, "Plot!").values()
+    asked = [f'copem/{name}/status.objects[:]{{id=="2"}}' for name in NAMES]
+    assert [path["value"] for path in lanes["paths"]] == [f"{path}.status" for path in asked]
+    assert [path["value"] for path in curves["paths"]] == [f"{path}.age_s" for path in asked]
+    assert {path.partition(".objects")[0] for path in asked} <= topics_in(replay)
+
+
+def test_two_compared_are_over_each_other_and_alone(replay: Path) -> None:
+    layout = layout_of(replay, ["PEM", "coPEM:1s"])
+    titles = [config["foxglovePanelTitle"] for config in panels_of(layout, "3D!").values()]
+    assert titles == ["PEM and coPEM:1s", "PEM", "coPEM:1s"]
+    both = layout["configById"]["3D!0"]["topics"]
+    shown = {topic for topic, says in both.items() if says["visible"] and "truth" not in topic}
+    assert shown == {f"copem/{name}/{kind}" for name in ("PEM", "coPEM:1s") for kind in ("scene", "uncertainty")}
+    (lanes,) = panels_of(layout, "StateTransitions!").values()
+    assert [path["label"] for path in lanes["paths"]] == ["PEM: 2", "coPEM:1s: 2"]
+    with pytest.raises(InputError, match="no configuration is named 'PME'; did you mean PEM"):
+        layout_of(replay, ["PME"])
+
+
+def test_the_sample_layout_is_what_the_command_makes(
+    replay: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "new" / "layout.json"
-    command = [sys.executable, str(ROOT / "tools/foxglove_layout.py"), str(replay), str(out)]
-    subprocess.run(command, check=True)
+    monkeypatch.setattr("sys.argv", ["copem-replay", "layout", str(replay.parent), "--out", str(out)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert (ended.value.code, capsys.readouterr().out) == (0, f"layout in {out}\n")
     assert out.read_bytes() == KEPT.read_bytes()
     assert json.loads(KEPT.read_text(encoding="utf-8")) == layout_of(replay)
-
-
-def test_the_camera_looks_at_what_is_there(replay: Path) -> None:
-    """The pedestrian crosses at the origin of the sample scene; the car ends there."""
-    (camera,) = {json.dumps(config["cameraState"]) for config in layout_of(replay)["configById"].values()}
-    x, y, _ = json.loads(camera)["targetOffset"]
-    assert abs(x) < 15
-    assert abs(y) < 10
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
@@ -123,6 +144,8 @@ def test_a_replay_of_a_ros_2_recording(tmp_path: Path) -> None:
     assert experiment is not None, wrong
     recordings, _ = read_logs(experiment, log_paths(source)[0], source)
     write_results(tmp_path / "out", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
-    panels = layout_of(tmp_path / "out/replay.mcap")["configById"].values()
+    layout = layout_of(tmp_path / "out/replay.mcap")
+    panels = panels_of(layout, "3D!").values()
     assert [panel["foxglovePanelTitle"] for panel in panels] == ["GT", "PEM", "coPEM", "gnn"]
-    assert {panel["followTf"] for panel in panels} == {"square"}
+    assert {panel["followTf"] for panel in panels} == {"copem_ego"}
+    assert len(panels_of(layout, "StateTransitions!")) == 1

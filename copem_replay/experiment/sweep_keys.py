@@ -1,0 +1,97 @@
+"""Sweeps as keys of an experiment file: values of one quantity at a time."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from copem_replay.core.components import Frozen, Id, Latency, Share
+from copem_replay.perception.config import Rate
+from copem_replay.perception.pem.ghosts import MeanNumber
+
+
+def _how_many(value: object) -> object:
+    if isinstance(value, str | list | tuple):
+        raise ValueError(f"expected how many units beside the ego's, such as 2 (a count, no names), found {value!r}")
+    return value
+
+
+Units = Annotated[int, Field(strict=True, ge=0, le=10**6), BeforeValidator(_how_many)]
+
+
+def _once(values: tuple[float, ...]) -> tuple[float, ...]:
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            raise ValueError(f"expected each value once, found {value:g} twice")
+    return values
+
+
+def _none_or_lasting(value: float) -> float:
+    if 0 < value < 0.001:
+        raise ValueError(f"expected 0 or at least 0.001 (s), found {value:g}")
+    return value
+
+
+Lasting = Annotated[float, Field(strict=True, ge=0, le=86_400), AfterValidator(_none_or_lasting)]
+"""A correlation time in seconds; 0: nothing lasts."""
+SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
+
+
+class SweptBy(Frozen):
+    """Which configurations each quantity changes, where not all change the same ones."""
+
+    latency_s: SweptNames | None = None
+    rate_hz: SweptNames | None = None
+    units: SweptNames | None = None
+    penetration_rate: SweptNames | None = None
+    correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+    ghosts_in_list: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+
+
+def _swept_by(value: object) -> str:
+    return "by" if isinstance(value, dict | SweptBy) else "names"
+
+
+Swept = Annotated[Annotated[SweptNames, Tag("names")] | Annotated[SweptBy, Tag("by")], Discriminator(_swept_by)]
+
+
+class Sweep(Frozen):
+    """Values of one quantity at a time at which `configurations` are run, too: names, or names by quantity.
+
+    By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
+    `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
+    `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
+    how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
+    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average.
+    """
+
+    configurations: Swept | None = None
+    latency_s: Annotated[tuple[Latency, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
+    correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
+    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        names = list(SweptBy.model_fields)
+        if not any(getattr(self, name) for name in names):
+            known = f"{', '.join(names[:-1])} or {names[-1]}"
+            raise ValueError(f"expected values of {known}, such as `latency_s: [0, 0.5, 1]`")
+        for quantity in SweptBy.model_fields if isinstance(self.configurations, SweptBy) else ():
+            if self.chosen(quantity) and not getattr(self, quantity):
+                raise ValueError(f"configurations.{quantity}: expected values of {quantity} beside it, found none")
+        return self
+
+    def chosen(self, quantity: str) -> tuple[str, ...] | None:
+        """The configurations that a quantity shall change; None: nothing is said of it."""
+        if not isinstance(self.configurations, SweptBy):
+            return self.configurations
+        chosen: tuple[str, ...] | None = getattr(self.configurations, quantity)
+        return chosen

@@ -1,0 +1,255 @@
+"""Split covariance intersection: of each error a part may hang together with the others, the rest is independent.
+
+Everywhere: means `x (n, d)`, covariances of the dependent and of the independent parts `(n, d, d)`, n ≥ 1, symmetric;
+their sums are positive definite, and so are the dependent parts or all of them are 0.
+
+P⁻¹ = Σ (Dᵢ/wᵢ + Nᵢ)⁻¹ over weights w ≥ 0 with sum 1: whatever the correlation of the dependent parts, diag(Dᵢ/wᵢ) is
+no less than their joint covariance, and P that of the best linear estimate under this bound. All inputs at once: the
+order does not matter, beyond rounding.
+
+Source: S. Julier, J. Uhlmann, "General decentralized data fusion with covariance intersection", Handbook of Data Fusion
+2001; H. Li, F. Nashashibi, M. Yang, "Split covariance intersection filter", IEEE T-ITS 14 (2013) (two inputs).
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from copem_replay.core.tracks import Bool, Float
+from copem_replay.fusion.covariance import FLATTEST, invert, invert_root, solve
+
+_GAP = 1e-10
+"""The optimum is found when no input could lower the criterion by more than this share of it (chosen)."""
+_CLOSE = 1e-6
+"""Scores that differ by less than this share: plain Newton steps, for the criterion's change is rounding (chosen)."""
+_RIDGE = 1e-12
+"""Added to the curvature, relative, for weights that change next to nothing (chosen)."""
+
+
+@nb.njit(cache=True, nogil=True)
+def split_covariance_intersection(
+    x: Float, dependent: Float, independent: Float, by_determinant: bool
+) -> tuple[Float, Float, Float, Float]:
+    """Mean (d,), covariance P (d, d), its independent part (d, d), and the weights (n,).
+
+    The weights make the determinant of P the least there is, or its trace. Without dependent parts it is inverse
+    variance, without independent ones covariance intersection; where P is also least for other weights (equal inputs
+    without independent parts), those nearest to equal ones on the way there are taken. The dependent part of the result
+    is P without its independent part.
+    """
+    n, d = x.shape
+    weight = _best_weights(dependent, independent, by_determinant)
+    information, total, P = np.zeros((n, d, d)), np.empty((d, d)), np.empty((d, d))
+    _criterion(dependent, independent, weight, by_determinant, information, total, P)
+    mean, independent_part, gain = x[0].copy(), np.zeros((d, d)), np.zeros((d, d))
+    for k in range(n):
+        if weight[k] == 1:
+            mean[:] = x[k]
+            return mean, dependent[k] + independent[k], independent[k].copy(), weight
+        for i in range(d):
+            for j in range(d):
+                gain[i, j] = 0.0
+                for m in range(d):
+                    gain[i, j] += P[i, m] * information[k, m, j]
+        for i in range(d):
+            for j in range(d):
+                # Relative to the first: no digits of millimetres go to kilometres.
+                mean[i] += gain[i, j] * (x[k, j] - x[0, j])
+                for m in range(d):
+                    for q in range(d):
+                        independent_part[i, j] += gain[i, m] * independent[k, m, q] * gain[j, q]
+    return mean, P, independent_part, weight
+
+
+@nb.njit(cache=True, nogil=True)
+def split_by_share(cov: Float, share: float) -> tuple[Float, Float]:
+    """Dependent and independent parts of covariances (n, d, d): `share` of each, and the rest."""
+    return share * cov, (1 - share) * cov
+
+
+@nb.njit(cache=True, nogil=True)
+def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
+    """The same of covariances (n, 2, 2): the dependent part has this variance on every axis, or all there is of it."""
+    dependent, independent = np.zeros(cov.shape), np.zeros(cov.shape)
+    for k in range(len(cov)):
+        ee, en, nn = cov[k, 0, 0], (cov[k, 0, 1] + cov[k, 1, 0]) / 2, cov[k, 1, 1]
+        middle, half = (ee + nn) / 2, np.hypot((ee - nn) / 2, en)
+        c2, s2 = ((ee - nn) / 2 / half, en / half) if half > 0 else (1.0, 0.0)
+        high = middle + half
+        low = max(middle - half, FLATTEST * high)
+        if high <= dependent_m2:  # all of it, to the last bit
+            dependent[k] = cov[k]
+            continue
+        high, low = dependent_m2, min(dependent_m2, low)
+        dependent[k, 0, 0] = (high + low) / 2 + (high - low) / 2 * c2
+        dependent[k, 1, 1] = (high + low) / 2 - (high - low) / 2 * c2
+        dependent[k, 0, 1] = dependent[k, 1, 0] = (high - low) / 2 * s2
+        for i in range(2):
+            for j in range(2):
+                independent[k, i, j] = cov[k, i, j] - dependent[k, i, j]
+    return dependent, independent
+
+
+# ---------------------------------------------------------------- the best weights
+#
+# w ↦ (D/w + N)⁻¹ = w (D + wN)⁻¹ = J is concave, so trace and logarithm of the determinant of (Σ Jᵢ)⁻¹ are convex. The
+# *score* of an input is how fast the criterion falls as it gains weight. At the optimum, and only there, inputs with
+# weight have one score and none scores more. Newton steps among the inputs with weight, as in fusion/covariance.py:
+# whoever reaches 0 leaves; once those with weight have one score, whoever scores most enters. Any weights make a valid
+# P, so where the steps end before that is a matter of size, never of validity.
+
+
+@nb.njit(cache=True, nogil=True)
+def _best_weights(dependent: Float, independent: Float, by_determinant: bool) -> Float:
+    n, d = dependent.shape[:2]
+    weight = np.full(n, 1.0 / n)
+    if n == 1:
+        return weight
+    has = np.ones(n, dtype=np.bool_)
+    information, total, P = np.zeros((n, d, d)), np.empty((d, d)), np.empty((d, d))
+    lever, score, bend = np.empty((n, d, d)), np.empty(n), np.empty(n)
+    value = _criterion(dependent, independent, weight, by_determinant, information, total, P)
+    for _ in range(40 + 4 * n):
+        _derive(dependent, independent, weight, by_determinant, P, lever, score, bend)
+        mean = off = 0.0
+        for k in range(n):
+            mean += weight[k] * score[k]
+        if not mean > 0:  # no dependent parts: weights change nothing
+            break
+        enters = -1
+        for k in range(n):
+            if has[k]:
+                off = max(off, abs(score[k] / mean - 1))
+            elif enters < 0 or score[k] > score[enters]:
+                enters = k
+        if off <= _GAP:
+            if enters < 0 or score[enters] <= (1 + _GAP) * mean:
+                break
+            has[enters] = True
+        change = _newton(lever, score / mean, bend / mean, has, P, mean, by_determinant)
+        longest, fall = np.inf, 0.0
+        for k in range(n):
+            fall += score[k] * change[k]
+            if change[k] < 0:
+                longest = min(longest, -weight[k] / change[k])
+        if not 0 < longest < np.inf:
+            break
+        step = min(1.0, longest)
+        for _ in range(40):
+            tried = np.maximum(weight + step * change, 0.0)
+            lower = _criterion(dependent, independent, tried, by_determinant, information, total, P)
+            if off <= _CLOSE or lower <= value - 1e-4 * step * fall:
+                break
+            step /= 2
+        for k in range(n):
+            gone = step == longest and change[k] < 0 and -weight[k] / change[k] <= longest * (1 + 1e-9)
+            has[k] = has[k] and not gone
+            weight[k] = max(weight[k] + step * change[k], 0.0) if has[k] else 0.0
+        weight /= weight.sum()
+        value = _criterion(dependent, independent, weight, by_determinant, information, total, P)
+    return weight
+
+
+@nb.njit(cache=True, nogil=True)
+def _criterion(
+    dependent: Float, independent: Float, weight: Float, by_determinant: bool, information: Float, total: Float,
+    P: Float,
+) -> float:  # fmt: skip
+    """Trace or logarithm of the determinant of P; writes P and what each input contributes to its inverse."""
+    n, d = dependent.shape[:2]
+    spread = np.empty((d, d))
+    total[:] = 0.0
+    for k in range(n):
+        information[k] = 0.0
+        if weight[k] == 0:
+            continue
+        for i in range(d):
+            for j in range(d):
+                spread[i, j] = dependent[k, i, j] / weight[k] + independent[k, i, j]
+        invert(spread, information[k])
+        total += information[k]
+    invert(total, P)
+    value = 0.0
+    if by_determinant:
+        invert_root(total, spread)
+        for i in range(d):
+            value += 2 * np.log(spread[i, i])
+    else:
+        for i in range(d):
+            value += P[i, i]
+    return value
+
+
+@nb.njit(cache=True, nogil=True)
+def _derive(
+    dependent: Float, independent: Float, weight: Float, by_determinant: bool, P: Float, lever: Float, score: Float,
+    bend: Float,
+) -> None:  # fmt: skip
+    """Of each input PJ′ (n, d, d), its score ⟨PJ′, P⟩ or trace PJ′, and −⟨PJ″, P⟩ or −trace PJ″ (n,)."""
+    n, d = dependent.shape[:2]
+    spread, inverse, first = np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
+    for k in range(n):
+        for i in range(d):
+            for j in range(d):
+                spread[i, j] = dependent[k, i, j] + weight[k] * independent[k, i, j]
+        score[k] = bend[k] = 0.0
+        if not spread[0, 0] > 0:  # nothing dependent, without weight
+            lever[k] = 0.0
+            continue
+        invert(spread, inverse)
+        _product(inverse, dependent[k], spread)
+        _product(spread, inverse, first)  # J′ = M⁻¹ D M⁻¹ with M = D + wN
+        _product(P, first, lever[k])
+        _product(inverse, independent[k], spread)
+        second = np.empty((d, d))
+        _product(spread, first, second)  # J″ = −2 M⁻¹ N J′
+        _product(P, second, spread)
+        for i in range(d):
+            if by_determinant:
+                score[k] += lever[k, i, i]
+                bend[k] += 2 * spread[i, i]
+                continue
+            for j in range(d):
+                score[k] += lever[k, i, j] * P[j, i]
+                bend[k] += 2 * spread[i, j] * P[j, i]
+
+
+@nb.njit(cache=True, nogil=True)
+def _newton(lever: Float, score: Float, bend: Float, has: Bool, P: Float, mean: float, by_determinant: bool) -> Float:
+    """Newton's change of the weights (n,), its sum 0; inputs without weight keep none. Scores and bends over `mean`."""
+    chosen = np.flatnonzero(has)
+    c, d = len(chosen), len(P)
+    curvature, root, half = np.empty((c, c)), np.empty((c, c)), np.empty((d, d))
+    largest = 0.0
+    for p in range(c):
+        if not by_determinant:
+            _product(P, lever[chosen[p]], half)
+        for q in range(p + 1):
+            total = 0.0
+            for i in range(d):
+                for j in range(d):
+                    one = lever[chosen[p], i, j] if by_determinant else 2 * half[i, j]
+                    total += one * lever[chosen[q], j, i]
+            curvature[p, q] = total / mean
+        curvature[p, p] += bend[chosen[p]]
+        largest = max(largest, curvature[p, p])
+    for p in range(c):
+        curvature[p, p] += _RIDGE * largest
+    invert_root(curvature, root)
+    gain, one = solve(root, score[chosen] - 1), solve(root, np.ones(c))
+    shift = gain.sum() / one.sum()  # so that the changes sum to 0
+    change = np.zeros(len(has))
+    for p in range(c):
+        change[chosen[p]] = gain[p] - shift * one[p]
+    return change
+
+
+@nb.njit(cache=True, nogil=True)
+def _product(a: Float, b: Float, out: Float) -> None:
+    d = len(a)
+    for i in range(d):
+        for j in range(d):
+            out[i, j] = 0.0
+            for m in range(d):
+                out[i, j] += a[i, m] * b[m, j]

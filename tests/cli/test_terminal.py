@@ -1,0 +1,233 @@
+"""Every command on terminals of 80 and 120 characters: no line is longer. In a pipe lines are whole."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import subprocess
+import sys
+import termios
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import copem_replay as cr
+from copem_replay.cli import main as cli
+from copem_replay.cli.progress import Lines, duration, with_progress
+from copem_replay.core.text import wrapped
+from copem_replay.metrics.summary_text import as_text, summary_text
+from tests.helpers.experiments import changed, drive
+from tests.helpers.recordings import Topic, truth_topic, write_recording
+
+ROOT = Path(__file__).parents[2]
+COMMAND = Path(sys.executable).with_name("copem-replay")
+MORE = """\
+configurations:
+  GT: {units: truth}
+  PEM: {units: [ego]}
+  everything half a second late: {units: all, latency_s: 0.5}
+  gnn: {units: all, latency_s: {ego: 0, default: 0.3}, fusion: {kind: gnn}}
+  a fusion of two units, with a long name: {units: all, latency_s: 1.0, fusion: {kind: gnn}}
+"""
+COMMANDS = ("", "info", "init", "check", "run", "compare", "plot", "report", "view", "layout", "schema", "convert")
+FORMATS = ("argoverse2", "scenarionet", "openlabel", "commonroad", "sumo", "csv")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+Show = Callable[..., list[str]]
+
+
+@pytest.fixture
+def show(monkeypatch: pytest.MonkeyPatch) -> Show:
+    """The lines that a command puts on a terminal of a width, problems and notes as well; bars left out."""
+
+    def shown(width: int, *words: str) -> list[str]:
+        screen = Terminal()
+        monkeypatch.setenv("COLUMNS", str(width))
+        for name in ("stdout", "stderr"):
+            monkeypatch.setattr(sys, name, screen)
+        monkeypatch.setattr(sys, "argv", ["copem-replay", *words])
+        with pytest.raises(SystemExit):
+            cli.main()
+        return [line for line in screen.getvalue().split("\n") if "\x1b" not in line]
+
+    return shown
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    drive(tmp_path / "drive.mcap")
+    lines = changed("show: {run: 0}", "measure: {onset: {kind: in_range, range_m: 60}, exact: false}")
+    (tmp_path / "e.yaml").write_text(re.sub(r"(?ms)^configurations:.*?(?=^measure)", MORE, lines))
+    return tmp_path
+
+
+@pytest.mark.parametrize("width", [80, 120])
+class TestWidth:
+    def test_help(self, show: Show, width: int) -> None:
+        for words in [[name] if name else [] for name in COMMANDS] + [["convert", name] for name in FORMATS]:
+            lines = show(width, *words, "--help")
+            assert len(lines) > 4, words
+            assert max(map(len, lines)) <= width, words
+            text = "\n".join(lines)
+            assert "..." not in text.replace("[ARGS]...", "").replace("}...", ""), f"{words}: cut"
+            assert not re.search(r"<(path|int|float|list|str)", text), f"{words}: types that are no words"
+
+    def test_a_command_is_one_line_of_help(self, show: Show, width: int) -> None:
+        lines = show(width, "--help")
+        commands = lines[lines.index("Commands:") + 1 :]
+        assert [line.split()[0] for line in commands if line] == list(COMMANDS[1:])
+        assert all(line.endswith(".") for line in commands if line)
+
+    def test_info(self, show: Show, here: Path, width: int) -> None:
+        more: list[Topic] = [truth_topic([], name="perception/object_recognition/tracking/objects_of_the_roadside")]
+        write_recording(here / "long.mcap", [(0.0, []), (0.1, [])], more=more)
+        for name in ("drive.mcap", "long.mcap"):
+            lines = show(width, "info", name)
+            assert len(lines) > 3
+            assert max(map(len, lines)) <= width
+
+    def test_info_of_the_samples(self, show: Show, monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+        monkeypatch.chdir(ROOT)
+        lines = show(width, "info", "logs/tc016d.mcap", "logs/crossing.mcap")
+        assert len(lines) > 40
+        assert max(map(len, lines)) <= width
+
+    def test_run_check_compare_and_report(self, show: Show, here: Path, width: int) -> None:
+        for words in (
+            ["check", "e.yaml"],
+            ["run", "e.yaml", "--report"],
+            ["compare", "out/e", "--baseline", "PEM"],
+            ["compare", "out/e", "--baseline", "nothing"],
+            ["report", "out/e"],
+            ["plot", "out/e", "--configurations", "none"],
+            ["view", "out/none"],
+            ["run", "e.yaml", "--runs", "0"],
+        ):
+            lines = show(width, *words)
+            assert any(lines), words
+            assert max(map(len, lines)) <= width, words
+
+    def test_run_ends_with_what_is_next(self, show: Show, here: Path, width: int) -> None:
+        assert show(width, "run", "e.yaml")[-2:] == ["next: copem-replay view out/e", ""]
+        (here / "e.yaml").write_text(changed("show: null"))
+        again = show(width, "run", "e.yaml", "--overwrite", "--out", "out/two words")
+        assert again[-2:] == ["next: copem-replay report 'out/two words'", ""]
+
+    def test_what_was_wrapped_says_the_same(self, show: Show, here: Path, width: int) -> None:
+        cr.run("e.yaml").save("out/e")
+        summary = cr.load_results("out/e").summary
+        whole, fitted = summary_text(summary), summary_text(summary, width)
+        assert max(map(len, fitted.splitlines())) <= width
+        assert set(whole.split()) == set(fitted.split())
+
+
+def test_the_width_is_that_of_the_terminal(here: Path) -> None:
+    """A real terminal of 50 characters; the same in a pipe has lines of any length."""
+    words = [COMMAND, "info", "drive.mcap"]
+    master, terminal = os.openpty()
+    termios.tcsetwinsize(terminal, (40, 50))
+    plain = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    subprocess.run(words, stdout=terminal, check=True, env=plain)
+    os.close(terminal)
+    seen = b""
+    try:
+        while piece := os.read(master, 1 << 16):
+            seen += piece
+    except OSError:  # what Linux says at the end
+        pass
+    os.close(master)
+    lines = seen.decode().split("\r\n")
+    assert len(lines) > 10
+    assert 40 < max(map(len, lines)) <= 50
+    piped = subprocess.run(words, capture_output=True, check=True, env=plain | {"COLUMNS": "50"}, text=True).stdout
+    assert max(map(len, piped.splitlines())) > 100
+
+
+class TestTables:
+    TABLE = pd.DataFrame({"name": ["a", "bb"], "first": [1.0, 22.5], "second": ["x", "y"]})
+
+    def test_whole_where_it_fits(self) -> None:
+        whole = "name  first  second\na         1  x\nbb     22.5  y"
+        assert as_text(self.TABLE) == as_text(self.TABLE, 19) == whole
+
+    def test_in_blocks_where_it_does_not(self) -> None:
+        assert as_text(self.TABLE, 18) == "name  first\na         1\nbb     22.5\n\nname  second\na     x\nbb    y"
+
+    def test_values_under_names_where_not_even_one_fits(self) -> None:
+        assert as_text(self.TABLE[["name", "first"]], 8) == "name\n  first\na\n  1\nbb\n  22.5"
+
+    def test_what_all_have_alike_is_said_once(self, here: Path) -> None:
+        cr.run("e.yaml").save("out/e")
+        summary = cr.load_results("out/e").summary
+        lines = summary_text(summary).splitlines()
+        assert lines[0].split()[:2] == ["configuration", "detected_share"]
+        assert "all configurations: n 4, list_rate_hz 10" in lines
+        one = summary_text(summary.head(1)).splitlines()
+        assert one[0].split()[:3] == ["configuration", "n", "list_rate_hz"]
+        summary.loc[0, "n"] = 5
+        assert "all configurations: list_rate_hz 10" in summary_text(summary).splitlines()
+
+
+class TestWrapped:
+    def test_at_spaces_and_indented(self) -> None:
+        assert wrapped("  one two three four", 11) == ["  one two", "      three", "      four"]
+
+    def test_whole_without_spaces_or_without_a_width(self) -> None:
+        assert wrapped("x" * 30, 10) == ["x" * 30]
+        assert wrapped("a path/that/stays-whole", 10) == ["a", "    path/that/stays-whole"]
+        assert wrapped("one two", None) == ["one two"]
+
+
+class TestProgress:
+    def test_a_line_a_minute_after_the_first(self, capsys: pytest.CaptureFixture[str]) -> None:
+        now_s = 1000.0
+        lines = Lines("replaying", lambda: now_s)
+        said = {}
+        for second in range(10, 201, 10):
+            now_s = 1000.0 + second
+            lines(second, 200)
+            if out := capsys.readouterr().err:
+                said[second] = out
+        assert said == {
+            60: "replaying: 30 %, 2 minutes left\n",
+            120: "replaying: 60 %, 1 minute left\n",
+            180: "replaying: 90 %, 20 seconds left\n",
+        }
+
+    def test_nothing_when_it_is_done_or_not_begun(self, capsys: pytest.CaptureFixture[str]) -> None:
+        now_s = 0.0
+        lines = Lines("replaying", lambda: now_s)
+        now_s = 100.0
+        lines(0, 10)
+        lines(10, 10)
+        assert capsys.readouterr().err == ""
+
+    def test_in_a_pipe_it_is_lines(self) -> None:
+        assert with_progress("replaying", lambda progress: progress).__class__ is Lines
+
+    def test_on_a_terminal_a_bar_with_what_is_done(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        screen = Terminal()
+        monkeypatch.setattr(sys, "stderr", screen)
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.setenv("COLUMNS", "80")
+        with_progress("replaying", lambda progress: progress(3, 4))
+        shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.getvalue())
+        assert "replaying" in shown
+        assert "75%" in shown
+        assert "left" in shown
+
+    @pytest.mark.parametrize(
+        ("time_s", "said"),
+        [(0.2, "1 second"), (59.4, "59 seconds"), (60, "1 minute"), (3500, "58 minutes"), (7800, "2 h 10 min")],
+    )
+    def test_durations(self, time_s: float, said: str) -> None:
+        assert duration(time_s) == said

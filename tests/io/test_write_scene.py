@@ -1,0 +1,214 @@
+"""What replay.mcap holds for looking at: statuses, ellipses, the truth as a scene, the frame to follow.
+
+The small experiment: a car is 60 m away, its onset, 1 s after the log starts, and drives towards the ego at 10 m/s.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
+
+import copem_replay as cr
+from copem_replay.io.write import foxglove_scene, foxglove_scene_ros2
+from copem_replay.io.write.drawing import Ellipse, Entity, Line, Pose, Text
+from copem_replay.io.write.message_family import STATUS, TRANSFORM
+from copem_replay.io.write.ros2_definitions import SCENE_UPDATE, definition
+from copem_replay.io.write.status import KNOWN, LISTED, NOT_LISTED
+from copem_replay.io.write.uncertainty import axes
+from tests.helpers.experiments import changed, drive
+
+mcap_ros2 = pytest.importorskip(
+    "mcap_ros2._dynamic", reason="needs mcap-ros2-support, which `pip install .[dev]` brings"
+)
+
+GREY = (0.5, 0.5, 0.5, 1.0)
+DRAWN = [
+    Entity(
+        "odd",
+        {"class": "car", "object": "1"},
+        lines=[Line([(0, 0, 0), (1, 2, 3), (4, 5, 6)], GREY, Pose(1, 2, 3, 0.5))],
+        texts=[Text("a text", GREY, Pose(7, 8, 9))],
+        ellipses=[Ellipse((4, 2, 0.1), GREY, Pose(yaw_rad=math.pi / 2)), Ellipse((1, 1, 1), GREY, Pose())],
+    ),
+    Entity("nothing"),
+    Entity("text alone", texts=[Text("x", GREY, Pose())] * 2),
+]
+
+
+def messages(path: Path, topic: str) -> list[tuple[int, bytes]]:
+    with path.open("rb") as file:
+        return [(m.log_time, m.data) for *_, m in make_reader(file).iter_messages(topics=[topic])]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("scene")
+    drive(place / "drive.mcap")
+    lines = (
+        "show: {run: 1}",
+        "measure: {onset: {kind: in_range, range_m: 60}, confirm: {hits: 2, of: 3}}",
+        "obstacles: [{polygon_m: [[10, 10], [20, 10], [20, 20]], height_m: 4.0}]",
+    )
+    text = changed(*lines).replace("  coPEM:", "  gnn: {units: all, latency_s: 0.2, fusion: {kind: gnn}}\n  coPEM:")
+    (place / "e.yaml").write_text(text)
+    return cr.run(place / "e.yaml").save(place / "r")
+
+
+class TestStatus:
+    def test_nothing_is_known_before_the_table_says_so(self, results: Path) -> None:
+        table = pd.read_parquet(results / "detections.parquet").query("run == 1")
+        seen = []
+        for row in table.itertuples():
+            found = messages(results / "replay.mcap", f"copem/{row.configuration}/status")
+            assert len(found) > 20
+            t0_ns = messages(results / "replay.mcap", "copem/truth/scene")[0][0]
+            for time_ns, data in found:
+                (status,) = (o["status"] for o in json.loads(data)["objects"] if o["id"] == row.object_id)
+                known = row.detected and (time_ns - t0_ns) * 1e-9 >= row.detection_s - 1e-6
+                assert status == NOT_LISTED or (status == KNOWN) == known, (row.configuration, time_ns)
+                seen.append(status)
+        assert set(seen) == {NOT_LISTED, LISTED, KNOWN}
+
+    def test_it_is_known_with_the_list_that_detects_it(self, results: Path) -> None:
+        table = pd.read_parquet(results / "detections.parquet").query("run == 1 and detected")
+        assert set(table["configuration"]) >= {"GT", "gnn"}
+        for row in table.itertuples():
+            found = messages(results / "replay.mcap", f"copem/{row.configuration}/status")
+            t0_ns = messages(results / "replay.mcap", "copem/truth/scene")[0][0]
+            known = [
+                time_ns
+                for time_ns, data in found
+                for each in json.loads(data)["objects"]
+                if each["id"] == row.object_id and each["status"] == KNOWN
+            ]
+            assert (known[0] - t0_ns) * 1e-9 == pytest.approx(row.detection_s, abs=1e-6)
+
+    def test_entries_are_as_old_as_their_latency(self, results: Path) -> None:
+        found = [json.loads(data)["objects"] for _, data in messages(results / "replay.mcap", "copem/coPEM/status")]
+        ages = {each["age_s"] for objects in found for each in objects if each["status"] != NOT_LISTED}
+        assert ages
+        assert all(age_s == pytest.approx(0.5, abs=1e-3) for age_s in ages)
+
+
+class TestTruth:
+    def test_an_outline_for_every_object(self, results: Path) -> None:
+        found = messages(results / "replay.mcap", "copem/truth/scene")
+        assert len(found) == 31
+        update = SceneUpdate.FromString(found[10][1])
+        bodies = {e.id: e for e in update.entities if not e.id.startswith("unit ")}
+        assert set(bodies) == {"1", "2", "3"}
+        pose = bodies["2"].lines[0].pose
+        assert (pose.position.x, pose.position.y) == pytest.approx((60.0, 0.0))
+        assert [text.text for text in bodies["2"].texts] == ["2 car"]
+        assert [text.text for text in bodies["3"].texts] == [], "not measured"
+        assert "unit ego" in {e.id for e in update.entities}
+
+    def test_what_does_not_move_is_said_once(self, results: Path) -> None:
+        ((_, data),) = messages(results / "replay.mcap", "copem/truth/static")
+        found = {e.id: e for e in SceneUpdate.FromString(data).entities}
+        assert set(found) == {"unit mast", "obstacle 0:0"}
+        (field,) = found["unit mast"].lines
+        radii = [math.hypot(point.x, point.y) for point in field.points]
+        assert radii == pytest.approx([80.0] * len(radii)), "the range of its PEM"
+        assert {round(point.z, 2) for point in field.points} == {-4.95}, "on the ground under it"
+        top = found["obstacle 0:0"].lines[1]
+        assert {(point.x, point.y) for point in top.points} == {(10, 10), (20, 10), (20, 20)}
+
+    def test_the_frame_to_follow_is_the_ego(self, results: Path) -> None:
+        found = [
+            FrameTransform.FromString(data) for _, data in messages(results / "replay.mcap", "copem/truth/transform")
+        ]
+        assert len(found) == 31
+        assert {(f.parent_frame_id, f.child_frame_id) for f in found} == {("global", "copem_ego")}
+        assert {(f.translation.x, f.translation.y, f.rotation.w) for f in found} == {(0.0, 0.0, 1.0)}
+
+    def test_without_an_ego_it_stands_amid_all_objects(self, tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap", host=None)
+        at = "measure: {onset: {kind: at, time_s: 1.0}, distance_to: mast}"
+        text = changed("show: {run: 0}", at, "ego: none").replace("  ego: {on: ego, height_m: 1.8, pem: onboard}\n", "")
+        (tmp_path / "e.yaml").write_text(text.replace("PEM: {units: [ego]}", "PEM: {units: [mast]}", 1))
+        folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
+        found = [
+            FrameTransform.FromString(data) for _, data in messages(folder / "replay.mcap", "copem/truth/transform")
+        ]
+        assert {f.child_frame_id for f in found} == {"copem_middle"}
+        assert len({f.translation.SerializeToString() for f in found}) == 1
+
+    def test_a_configuration_of_that_name_has_its_topics(self, tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap")
+        (tmp_path / "e.yaml").write_text(changed("show: {run: 0}").replace("  GT:", "  truth:"))
+        folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
+        assert messages(folder / "replay.mcap", "copem/truth/objects")
+        assert SceneUpdate.FromString(messages(folder / "replay.mcap", "copem/truth/scene")[0][1]).entities[0].cubes
+        assert not messages(folder / "replay.mcap", "copem/truth/transform")
+
+
+class TestUncertainty:
+    @pytest.mark.parametrize(
+        ("covariance", "expected"),
+        [
+            ((4.0, 0.0, 1.0), (2.0, 1.0, 0.0)),
+            ((1.0, 0.0, 4.0), (2.0, 1.0, math.pi / 2)),
+            ((1.0, 0.5, 1.0), (math.sqrt(1.5), math.sqrt(0.5), math.pi / 4)),
+        ],
+    )
+    def test_axes(self, covariance: tuple[float, float, float], expected: tuple[float, float, float]) -> None:
+        found = axes(*(np.array([value]) for value in covariance))
+        assert [float(value[0]) for value in found] == pytest.approx(expected)
+
+    def test_ellipses_of_two_sigma_where_a_covariance_is_claimed(self, results: Path) -> None:
+        found = [SceneUpdate.FromString(data) for _, data in messages(results / "replay.mcap", "copem/PEM/uncertainty")]
+        ellipses = [cylinder for update in found for entity in update.entities for cylinder in entity.cylinders]
+        assert len(ellipses) > 5
+        for ellipse in ellipses:  # of a variance of 0.5 m² in all directions
+            assert (ellipse.size.x, ellipse.size.y) == pytest.approx((4 * math.sqrt(0.5),) * 2)
+        late = messages(results / "replay.mcap", "copem/coPEM/uncertainty")
+        faded = [e.cylinders[0].color.a for _, data in late for e in SceneUpdate.FromString(data).entities]
+        assert set(np.round(faded, 3)) == {0.375}, "half as old as what is palest"
+        truth = messages(results / "replay.mcap", "copem/GT/uncertainty")
+        assert all(not SceneUpdate.FromString(data).entities for _, data in truth)
+
+
+def test_both_families_draw_the_same() -> None:
+    ours = SceneUpdate.FromString(foxglove_scene.drawn(DRAWN, 1_500_000_000, "map"))
+    decode = mcap_ros2.generate_dynamic(SCENE_UPDATE, definition(SCENE_UPDATE).decode())[SCENE_UPDATE]
+    theirs = decode(foxglove_scene_ros2.drawn(DRAWN, 1_500_000_000, "map"))
+    assert [e.id for e in theirs.entities] == ["odd", "nothing", "text alone"]
+    for one, other in zip(ours.entities, theirs.entities, strict=True):
+        assert (other.timestamp.sec, other.timestamp.nanosec, other.frame_id) == (1, 500_000_000, "map")
+        assert [(m.key, m.value) for m in one.metadata] == [(m.key, m.value) for m in other.metadata]
+        for kind in ("cylinders", "lines", "texts"):
+            pairs = list(zip(getattr(one, kind), getattr(other, kind), strict=True))
+            for a, b in pairs:
+                for name in ("position", "orientation"):
+                    for axis in "xyz":
+                        assert getattr(getattr(a.pose, name), axis) == getattr(getattr(b.pose, name), axis)
+                assert (a.color.r, a.color.a) == (b.color.r, b.color.a)
+        assert [(p.x, p.y, p.z) for line in one.lines for p in line.points] == [
+            (p.x, p.y, p.z) for line in other.lines for p in line.points
+        ]
+        assert [text.text for text in one.texts] == [text.text for text in other.texts]
+        assert [(c.size.x, c.size.y, c.size.z, c.top_scale) for c in one.cylinders] == [
+            (c.size.x, c.size.y, c.size.z, c.top_scale) for c in other.cylinders
+        ]
+
+
+def test_both_families_place_a_frame_alike() -> None:
+    pose = Pose(1.0, 2.0, 3.0, math.pi / 3)
+    ours = FrameTransform.FromString(foxglove_scene.transform("map", pose, 2_000_000_001, "copem_ego"))
+    decode = mcap_ros2.generate_dynamic(TRANSFORM, definition(TRANSFORM).decode())[TRANSFORM]
+    theirs = decode(foxglove_scene_ros2.transform("map", pose, 2_000_000_001, "copem_ego"))
+    for found in (ours, theirs):
+        assert (found.parent_frame_id, found.child_frame_id) == ("map", "copem_ego")
+        assert (found.translation.x, found.translation.y, found.translation.z) == (1.0, 2.0, 3.0)
+        assert (found.rotation.x, found.rotation.z, found.rotation.w) == pytest.approx((0, 0.5, math.sqrt(0.75)))
+    assert (ours.timestamp.seconds, ours.timestamp.nanos) == (theirs.timestamp.sec, theirs.timestamp.nanosec) == (2, 1)
+    assert "string status" in definition(STATUS).decode()

@@ -1,0 +1,75 @@
+"""What memory costs: numbers that last against new ones, and the crossing with and without it.
+
+Medians of nine calls each, in turn, in seconds of the processor: one thread works, and what else the machine does is
+not counted.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from statistics import median
+
+import numpy as np
+
+from copem_replay.core.lasting import ListTimes, drifting, held
+from copem_replay.core.random import CounterRng, RandomKey, object_words
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.run import run
+
+LISTS, OBJECTS, RUNS, STEP_NS = 600, 20, 50, 100_000_000
+"""One unit at 10 Hz, a minute."""
+
+
+def memory(experiment: Experiment, recordings: list[Recording]) -> Iterator[dict[str, object]]:
+    yield numbers()
+    plain = experiment.model_copy(update={"runs": 2, "show": None})
+    lasting = remembering(plain)
+    took = interleaved([lambda: run(plain, recordings), lambda: run(lasting, recordings)])
+    yield {"memory_crossing_ratio": round(took[1] / took[0], 3), "seconds": round(took[1], 3)}
+
+
+def numbers() -> dict[str, object]:
+    stamps = 1_700_000_000_000_000_000 + np.arange(LISTS) * STEP_NS
+    none = np.zeros(LISTS, dtype=np.int64)
+    words = np.repeat(object_words([str(k) for k in range(OBJECTS)]), LISTS)
+    random_key = RandomKey(("u",), np.tile(none, OBJECTS), words, np.tile(stamps, OBJECTS))
+    lists = ListTimes(stamps, none, np.tile(np.arange(LISTS), OBJECTS))
+    rng, runs = CounterRng(1, "bench"), np.arange(RUNS)
+    uniform, slow, quick, normal, drifts = interleaved([
+        lambda: rng.uniform("p", random_key, runs),
+        lambda: held(rng, "p", random_key, runs, 1.0),
+        lambda: held(rng, "p", random_key, runs, 0.5),
+        lambda: rng.normal("p", random_key, runs),
+        lambda: drifting(rng, "p", random_key, runs, 1.0, lists=lists),
+    ])  # fmt: skip
+    return {
+        "memory_held_ratio_at_0.1": round(slow / uniform, 2),
+        "memory_held_ratio_at_0.2": round(quick / uniform, 2),
+        "memory_drifting_ratio": round(drifts / normal, 2),
+        "uniform_ns": round(uniform / len(words) / RUNS * 1e9, 2),
+        "normal_ns": round(normal / len(words) / RUNS * 1e9, 2),
+    }
+
+
+def remembering(experiment: Experiment) -> Experiment:
+    """The same with all that its PEMs draw lasting: detection held, errors drifting with a bias."""
+    data = experiment.as_written()
+    errors = [{"share": 0.7, "correlation_s": 1.0}, {"share": 0.3, "correlation_s": "always"}]
+    lasts = {"detection": [{"share": 0.6, "correlation_s": 0.8}], **dict.fromkeys(("position", "speed"), errors)}
+    data["pems"] = {name: {"couples": couples, "memory": lasts} for name, couples in data["pems"].items()}
+    return Experiment.model_validate(data)
+
+
+def interleaved(calls: list[Callable[[], object]], times: int = 9) -> list[float]:
+    """Median processor seconds of each call, in turn, after one that compiles and warms up."""
+    for call in calls:
+        call()
+    took: list[list[float]] = [[] for _ in calls]
+    for _ in range(times):
+        for seconds, call in zip(took, calls, strict=True):
+            start = time.process_time()
+            call()
+            seconds.append(time.process_time() - start)
+    return [median(seconds) for seconds in took]
