@@ -240,7 +240,7 @@ def _faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFa
     return UnitFaults(rows, np.isinf(seen.arrives_s[0]))
 
 
-def _without_truth(world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None) -> ObjectLists:
+def _without_truth(world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None = None) -> ObjectLists:
     """The units' lists as a real fusion sees them: no truth ids, and in no order that means anything."""
     found, recorded, experiment = world.found, world.recorded, world.experiment
     words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]

@@ -16,9 +16,12 @@ from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.claims import DrawnClaims, claims_of
 from copem_replay.perception.pem.classes import Classes, drawn_class
+from copem_replay.perception.pem.ghosts import AtPlaces, Beside, Ghosts, InField
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.pem.scores import Scores
+from copem_replay.perception.pem.track_ids import TrackIds
 from copem_replay.perception.perceive import draws_of
+from copem_replay.perception.unit_errors import Clock, Outages, PoseError
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from tests.helpers import scenes
@@ -212,3 +215,17 @@ def test_what_is_not_said_is_not_written() -> None:
     pem = Pem.model_validate({"couples": SEES_ALL, "tracks": {"lasts_s": 20}})
     assert pem.model_dump(mode="json").keys() == {"couples", "tracks"}
     assert isinstance(Pem.model_validate(SEES_ALL).model_dump(mode="json"), list)
+
+
+def test_the_guide_holds(tmp_path: Path) -> None:
+    """The example of docs/unit-errors.md is an experiment."""
+    text = (Path(__file__).parents[2] / "docs" / "unit-errors.md").read_text(encoding="utf-8")
+    example = text.partition("```yaml\n")[2].partition("```")[0]
+    whole = "version: 1\nlogs: [a.mcap]\nconfigurations: {all: {units: all, fusion: {kind: gnn}}}\n" + example
+    (tmp_path / "a.mcap").touch()
+    plan, found = problems(source_of(tmp_path, whole))
+    assert found == []
+    assert plan is not None
+    every = (PoseError, Clock, Outages, Ghosts, InField, AtPlaces, Beside, Classes, Scores, TrackIds)
+    for key in {key for model in every for key in model.model_fields} - {"kind"}:
+        assert key in text, key
