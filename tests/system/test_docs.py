@@ -45,7 +45,7 @@ def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
     [
         ("README.md", [], ["copem-replay run"]),
         ("docs/worked_example.md", ["copem-replay run"], ["python tools/paper.py"]),
-        ("docs/which_fusion.md", ["copem-replay run"], ["copem-replay compare"]),
+        ("docs/which_fusion.md", ["copem-replay run"] * 2, ["copem-replay compare"] * 2),
     ],
 )
 def test_pages_show_what_their_commands_print(
