@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from copem_replay.cli.options import Ego, ExperimentFile, FromS, LogFile, LogFiles, Logs, ToS
+from copem_replay.cli.options import Ego, ExperimentFile, FromS, LogFiles, Logs, OneDrive, ToS
 from copem_replay.cli.terminal import complain, note, say, say_blocks, width_of
 from copem_replay.core.errors import InputError
 
@@ -23,12 +23,15 @@ if TYPE_CHECKING:
 def info(
     logs: LogFiles,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON: one array, an entry per recording.")] = False,
+    together: OneDrive = False,
 ) -> int:
     """Describe recordings: what is in them, what is missing.
 
     Topics, object lists, objects, span, rate, ego vehicle. The exit code is 0 when at least one object list is
     readable, else 2.
     """
+    if together:
+        return _clocks(logs)
     from copem_replay.experiment.draft.findings import as_json as plain
     from copem_replay.experiment.draft.survey import survey
     from copem_replay.experiment.draft.survey_text import describe
@@ -42,21 +45,35 @@ def info(
     return 0 if any(s.readable for s in surveys) else 2
 
 
-def init(log: LogFile) -> int:
+def _clocks(logs: Sequence[Path]) -> int:
+    """Say how far the clocks of recordings are ahead of the first one's."""
+    from copem_replay.experiment.draft.clocks import clocks
+
+    if len(logs) < 2:
+        raise InputError(f"--together: expected several recordings of one drive, found {len(logs)}")
+    for found in clocks(logs):
+        say(f"{found.path}: clock_offset_s against {logs[0]}: {found.words()}; by {' and '.join(found.lists)}")
+    return 0
+
+
+def init(logs: LogFiles, together: OneDrive = False) -> int:
     """Print an experiment that replays a recording, with comments.
 
     copem-replay init LOG > experiment.yaml. Its paths are relative to the working folder. For lists of an unknown
     schema, `read:` is proposed from the names of their fields. The exit code is 2 when no list of true objects is
     readable.
     """
-    from copem_replay.cli.api.recordings import draft_of, encodable
+    from copem_replay.cli.api.recordings import draft_of, draft_together, encodable
     from copem_replay.experiment.draft.template import unfinished
 
-    text, found = draft_of(log)
+    if len(logs) > 1 and not together:
+        raise InputError(f"{logs[1]}: expected one recording, found {len(logs)}; `--together`: they are of one drive")
+    for log in logs:
+        encodable(log)
+    text, found = draft_of(logs[0]) if len(logs) == 1 else draft_together(logs)
     if text is None:
         print(unfinished(found), end="")
-        raise InputError(found.reason or f"{log}: no list of true objects")
-    encodable(log)
+        raise InputError(found.reason or f"{logs[0]}: no list of true objects")
     print(text, end="")
     return 0
 

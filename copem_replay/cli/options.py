@@ -28,6 +28,9 @@ ToS: TypeAlias = Annotated[
     float | None,
     typer.Option("--to", metavar="SECONDS", help="End of the window that is read, since the log starts [its end]."),
 ]
+OneDrive: TypeAlias = Annotated[
+    bool, typer.Option("--together", help="The recordings are of one drive: how far are their clocks apart?")
+]
 Baseline: TypeAlias = Annotated[
     str | None, typer.Option("--baseline", metavar="NAME", help="Configuration to compare with [the one named ideal].")
 ]

@@ -48,7 +48,7 @@ def run(
         note(place.notes)
         place.notes.clear()
         study = read_study(source, skip_unreadable=skip_unreadable)
-        check_inputs(place, [experiment, *(recording.path for recording in study.recordings)])
+        check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
         url = _viewer(study.experiment, viewer) if live or viewer is not None else None
         from copem_replay.cli.api.run import fill, replayed
         from copem_replay.metrics.summary_text import summary_text

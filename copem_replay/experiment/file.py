@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -15,6 +15,7 @@ from copem_replay.core.errors import ExperimentError
 from copem_replay.core.yaml import AliasesError, Key, NotYamlError, read
 from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.shape_problems import by_key
+from copem_replay.io.together import Place, Together
 
 
 class Problem(str):
@@ -132,12 +133,12 @@ def _problems(source: Source, error: ValidationError) -> Iterator[str]:
         yield source.at(key, message)
 
 
-def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
+def log_paths(source: Source) -> tuple[dict[Place, Key | None], list[str]]:
     """The recordings to replay and where the file names each, globs resolved (sorted); which patterns match none."""
-    paths: dict[Path, Key | None] = {}
+    paths: dict[Place, Key | None] = {}
     problems: list[str] = []
     for k, (key, pattern, named) in _patterns(source).items():
-        found = matching(pattern, folder_of(source))
+        found = _places(source, k, pattern)
         paths |= dict.fromkeys(found, None if source.logs else ("logs", k))
         if not found and source.logs:
             problems.append(f"{source.logs_option}: no file matches {pattern!r}")
@@ -149,34 +150,77 @@ def log_paths(source: Source) -> tuple[dict[Path, Key | None], list[str]]:
     return paths, problems
 
 
-def named_paths(source: Source) -> Iterator[tuple[str, Path]]:
+def named_paths(source: Source) -> Iterator[tuple[str, Place]]:
     """Each recording as often as it is named, and by what: `logs[0]`, `--log`."""
     for k, (_, pattern, _) in _patterns(source).items():
         name = source.logs_option if source.logs else f"logs[{k}]"
-        yield from ((name, path) for path in matching(pattern, folder_of(source)))
+        yield from ((name, place) for place in _places(source, k, pattern))
 
 
-def _patterns(source: Source) -> dict[int, tuple[Key, str, bool]]:
-    """By its number what each entry of `logs` matches: the key that says it, the pattern, whether it has a name."""
+def _places(source: Source, k: int, pattern: str | None) -> list[Place]:
+    """What an entry of `logs` names: files that match, or several recordings as one."""
+    if pattern is not None:
+        return list(matching(pattern, folder_of(source)))
+    entry = source.data["logs"][k]
+    offsets = entry.get("clock_offset_s")
+    return [together(entry["together"], offsets if isinstance(offsets, dict) else {}, folder_of(source))]
+
+
+def together(names: Sequence[str], offset_s: Mapping[str, object], folder: Path) -> Together:
+    """Several recordings, by paths relative to a folder, as one log; what is no offset counts as none."""
+    said = [offset_s.get(name, 0.0) for name in names]
+    ahead_s = tuple(float(one) if isinstance(one, int | float) else 0.0 for one in said)
+    return Together(tuple(folder / name for name in names), ahead_s)
+
+
+def _patterns(source: Source) -> dict[int, tuple[Key, str | None, bool]]:
+    """By its number what each entry of `logs` matches: its key, the pattern (None: several), whether it has a name."""
     entries = source.data.get("logs")
-    result: dict[int, tuple[Key, str, bool]] = {}
+    result: dict[int, tuple[Key, str | None, bool]] = {}
     for k, entry in enumerate(entries if isinstance(entries, list | tuple) else []):
         if isinstance(entry, str):
             result[k] = (("logs", k), entry, False)
         elif isinstance(entry, dict) and isinstance(entry.get("file"), str):
             result[k] = (("logs", k, "file"), entry["file"], entry.get("name") is not None)
+        elif isinstance(entry, dict) and _all_text(entry.get("together")):
+            result[k] = (("logs", k, "together"), None, entry.get("name") is not None)
     return result
+
+
+def _all_text(names: object) -> bool:
+    return isinstance(names, list | tuple) and len(names) > 1 and all(isinstance(name, str) for name in names)
 
 
 def entries_of(experiment: Experiment, source: Source) -> tuple[str | LogSettings, ...]:
     """The entries of `logs`, a recording each, relative to the working folder."""
-    entries: dict[Path, str | LogSettings] = {}
+    entries: dict[Place, str | LogSettings] = {}
     for k, (_, pattern, _) in _patterns(source).items():
         entry = experiment.logs[k]
-        for path in matching(pattern, folder_of(source)):
-            alone = entry.model_copy(update={"file": str(path)}) if isinstance(entry, LogSettings) else str(path)
-            entries.setdefault(path, alone)
+        for place in _places(source, k, pattern):
+            alone = str(place) if isinstance(entry, str) else at_place(entry, place)
+            entries.setdefault(place, alone)
     return tuple(entries.values())
+
+
+def at_place(entry: LogSettings, place: Place, called: Callable[[Path], str] = str) -> LogSettings:
+    """The settings of a recording, or of several as one, that lie elsewhere, or are called otherwise."""
+    if isinstance(place, Path):
+        return entry.model_copy(update={"file": called(place)})
+    names = tuple(called(path) for path in place.paths)
+    offsets = {name: ahead_s for name, ahead_s in zip(names, place.ahead_s, strict=True) if ahead_s}
+    return entry.model_copy(update={"together": names} | ({"clock_offset_s": offsets} if offsets else {}))
+
+
+def places_of(entry: LogSettings, folder: Path) -> list[Place]:
+    """The recordings that settings are for."""
+    if entry.file is not None:
+        return list(matching(entry.file, folder))
+    return [together(entry.together or (), entry.clock_offset_s, folder)]
+
+
+def identity(place: Place) -> str:
+    """The same for the same recordings, whatever leads there."""
+    return os.path.realpath(place) if isinstance(place, Path) else "\n".join(map(os.path.realpath, place.paths))
 
 
 def folder_of(source: Source) -> Path:
@@ -220,9 +264,11 @@ def matching(pattern: str, folder: Path) -> list[Path]:
     return [folder / name for name in sorted(glob.glob(pattern, root_dir=folder, recursive=True))]
 
 
-def is_there(path: Path) -> bool:
+def is_there(place: Place) -> bool:
     """Whether there is something of this name; a name no file can have is none."""
+    if isinstance(place, Together):
+        return all(map(is_there, place.paths))
     try:
-        return path.exists()
+        return place.exists()
     except (OSError, ValueError):
         return False

@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from copem_replay.communication.link import ConstantLink, LinkModel
-from copem_replay.core.components import Count, Frozen, Id, Latency, Positive, Slot, at_key, described
+from copem_replay.core.components import Count, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
 from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
@@ -142,10 +142,13 @@ class LogSettings(Frozen):
     """A recording, and what is otherwise for it: keys that are given replace those of the experiment, lists whole.
 
     `file`: as a plain entry, wildcards too. `name`: what the log is called, by default as its file. Of `units` and
-    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it.
+    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it. `together`, in the place of
+    `file`: several recordings of one drive; `clock_offset_s`: how far the clock of one is ahead of the first one's.
     """
 
-    file: Annotated[str, Field(min_length=1)]
+    file: Annotated[str, Field(min_length=1)] | None = None
+    together: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)] | None = None
+    clock_offset_s: dict[str, Number] = Field(default_factory=dict)
     name: Annotated[Id, Field(min_length=1)] | None = None
     ego: Ego | None = None
     window_s: WindowOf | None = None
@@ -153,6 +156,21 @@ class LogSettings(Frozen):
     obstacles: tuple[Obstacle, ...] | None = None
     read: HowRead | None = None
     measure: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.file is None) == (self.together is None):
+            raise ValueError("expected one of `file: <recording>` and `together: [<recording>, <recording>]`")
+        paths = self.together or ()
+        if len(set(paths)) < len(paths):
+            raise ValueError(f"together: expected each recording once, found {max(paths, key=paths.count)!r} twice")
+        for name, offset_s in self.clock_offset_s.items():
+            if name not in paths:
+                expected = ", ".join(paths[1:]) or "none without `together`"
+                raise ValueError(f"clock_offset_s: expected a recording of `together` ({expected}), found {name!r}")
+            if name == paths[0] and offset_s:
+                raise ValueError(f"clock_offset_s: {name!r} is the first, by whose clock the others are ahead")
+        return self
 
     @field_validator("measure")
     @classmethod

@@ -16,12 +16,14 @@ from copem_replay.experiment.drive import SettingsError, of_log, with_settings
 from copem_replay.experiment.file import (
     Problem,
     Source,
+    at_place,
     folder_of,
+    identity,
     is_there,
     log_paths,
-    matching,
     named_paths,
     parse,
+    places_of,
 )
 from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.shape_problems import by_key
@@ -29,6 +31,7 @@ from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
+from copem_replay.io.together import Place, Together, first_of
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
 
@@ -99,7 +102,7 @@ def log_names(paths: Sequence[Path]) -> list[str]:
 
 
 def read_logs(
-    experiment: Experiment, paths: Mapping[Path, Key | None] | Iterable[Path], source: Source | None
+    experiment: Experiment, paths: Mapping[Place, Key | None] | Iterable[Place], source: Source | None
 ) -> tuple[list[Recording], list[Refused]]:
     """The recordings that can be replayed, and what is wrong with those that cannot.
 
@@ -112,8 +115,9 @@ def read_logs(
     mine = settings_by_place(experiment, source)
     for path, key in keys.items():
         if not is_there(path):
-            refused.append(Refused(path, "no such file", key))
-        elif (place := os.path.realpath(path)) not in recordings:
+            gone = (one for one in (path.paths if isinstance(path, Together) else (path,)) if not is_there(one))
+            refused.append(Refused(next(gone), "no such file", key))
+        elif (place := identity(path)) not in recordings:
             entry, settings = mine.get(place, (None, None))
             recording, wrong = _read(experiment if settings is None else with_settings(experiment, settings), path)
             refused += [log.within(entry, settings) for log in wrong]
@@ -138,10 +142,10 @@ def settings_by_place(experiment: Experiment, source: Source | None) -> dict[str
     """The entries of `logs` that are mappings, and their numbers, by where the recordings lie."""
     folder = Path() if source is None else folder_of(source)
     return {
-        os.path.realpath(path): (k, entry)
+        identity(place): (k, entry)
         for k, entry in enumerate(experiment.logs)
         if isinstance(entry, LogSettings)
-        for path in matching(entry.file, folder)
+        for place in places_of(entry, folder)
     }
 
 
@@ -152,22 +156,22 @@ def bound(experiment: Experiment, recordings: Sequence[Recording], source: Sourc
         return experiment
     logs = []
     for recording in recordings:
-        _, settings = mine.get(os.path.realpath(recording.path), (0, LogSettings(file=".")))
-        named = {"file": str(recording.path), "name": recording.scene.log}
-        logs.append(settings.model_copy(update=named))
+        _, settings = mine.get(identity(recording.place), (0, LogSettings(file=".")))
+        logs.append(at_place(settings, recording.place).model_copy(update={"name": recording.scene.log}))
     return experiment.model_copy(update={"logs": tuple(logs)})
 
 
 def _named(source: Source) -> dict[str, list[str]]:
     """By what each file is named in an experiment, or by options: `logs[0]`, `--log`."""
     names: dict[str, list[str]] = {}
-    for name, path in named_paths(source):
-        if is_there(path):
-            names.setdefault(os.path.realpath(path), []).append(name)
+    for name, place in named_paths(source):
+        if is_there(place):
+            names.setdefault(identity(place), []).append(name)
     return names
 
 
-def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Refused]]:
+def _read(experiment: Experiment, place: Place) -> tuple[Recording | None, list[Refused]]:
+    path = first_of(place)
     try:
         str(place_of(path)).encode()
     except UnicodeEncodeError:
@@ -177,7 +181,7 @@ def _read(experiment: Experiment, path: Path) -> tuple[Recording | None, list[Re
     fields = experiment.read if isinstance(experiment.read, ReadFields) else None
     beside = {asked.topic for asked in experiment.recorded.values()}
     how = partial(
-        read, path, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside,
+        read, place, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside,
         window_s=experiment.window_s,
     )  # fmt: skip
     try:
@@ -249,7 +253,7 @@ def across_logs(experiment: Experiment, recordings: Sequence[Recording], source:
 
     scenes = [recording.scene for recording in recordings]
     for place, (entry, settings) in settings_by_place(experiment, source).items():
-        for scene in (r.scene for r in recordings if os.path.realpath(r.path) == place):
+        for scene in (r.scene for r in recordings if identity(r.place) == place):
             if [one.log for one in scenes].count(scene.log) > 1:
                 yield at(
                     ("logs", entry, "name"), f"expected a name of its own, found {scene.log!r} of another log, too"

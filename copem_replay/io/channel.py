@@ -21,6 +21,7 @@ class Channel:
     expected: int | None = None  # of a damaged file: how many its index promises, where that is known
     schema_encoding: str = ""
     schema_data: bytes = field(default=b"", repr=False)
+    ahead_ns: int = 0  # how far stamps in its messages are ahead of the times they were logged at, by another clock
 
 
 def schema_name(channel: Channel) -> str:

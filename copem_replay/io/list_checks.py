@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool, Int, Scene, Tracks
-from copem_replay.io.recorded_osi import RecordedLists
 from copem_replay.io.short_tracks import entries_of
 from copem_replay.io.time_offset import TimeOffset, time_offset
+
+if TYPE_CHECKING:
+    from copem_replay.io.recorded_osi import RecordedLists
 
 LONGEST_S = 1.0
 """No list is later than this, as far as it is estimated (chosen)."""

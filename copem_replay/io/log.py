@@ -8,6 +8,7 @@ that lies, a file that was cut off, a checksum that fails) is read from start to
 from __future__ import annotations
 
 import io
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Set
@@ -27,6 +28,7 @@ from copem_replay.io.containers.mcap_indexed import in_order, summary_of
 from copem_replay.io.containers.mcap_records import DAMAGE, without_trace
 from copem_replay.io.containers.mcap_recovery import FromStart
 from copem_replay.io.containers.unsupported import check_magic
+from copem_replay.io.together import AHEAD
 from copem_replay.io.window import ALWAYS, Span, Window, kept
 
 _READ_AT_ONCE = 1 << 16
@@ -226,6 +228,11 @@ def _channels_of(summary: Summary) -> tuple[Channel, ...]:
     )
 
 
+def _ahead_ns(said: str) -> int:
+    """As the metadata of a channel has it that was written from several recordings."""
+    return int(said) if re.fullmatch(r"-?[0-9]{1,18}", said) else 0
+
+
 def _channel(number: int, channel: Any, schema: Any, messages: int, expected: int | None = None) -> Channel:
     return Channel(
         number=number,
@@ -236,4 +243,5 @@ def _channel(number: int, channel: Any, schema: Any, messages: int, expected: in
         expected=expected,
         schema_encoding=schema.encoding if schema is not None else "",
         schema_data=schema.data if schema is not None else b"",
+        ahead_ns=_ahead_ns(channel.metadata.get(AHEAD, "")),
     )

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from copem_replay.io.containers.joined import Joined, open_joined
 from copem_replay.io.containers.osi_trace import is_trace, open_trace
 from copem_replay.io.containers.rosbag2 import open_bag
 from copem_replay.io.log import Log, open_mcap
+from copem_replay.io.together import Place, Together
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,17 @@ CONTAINERS: Final = (
 """The first that takes a path opens it."""
 
 
-def open_log(path: Path) -> Log:
-    """Look at a recording. Raises RecordingError where it is none, or nothing in it can be read."""
+def open_log(place: Place) -> Log:
+    """Look at a recording, or at several as one. Raises RecordingError where nothing in one of them can be read."""
+    return open_joined(place, _open_one) if isinstance(place, Together) else _open_one(place)
+
+
+def together_of(log: Log) -> Together | None:
+    """The recordings that a log is made of; None: it is one."""
+    return log.place if isinstance(log, Joined) else None
+
+
+def _open_one(path: Path) -> Log:
     return next(container for container in CONTAINERS if container.takes(path)).open(path)
 
 

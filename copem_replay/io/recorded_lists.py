@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from copem_replay.io.recorded_osi import RecordedLists, as_tracks
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.registry import known_lists
+from copem_replay.io.together import Place
 from copem_replay.io.window import Window
 from copem_replay.io.world_frame import LogContext, in_world, lists_of, log_context
 from copem_replay.io.write import detail_json as detail
@@ -34,7 +34,7 @@ from copem_replay.io.write.ros2_definitions import STRING
 
 @np.errstate(over="ignore", invalid="ignore")
 def read_listed(
-    path: Path, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+    path: Place, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
 ) -> RecordedLists | None:
     """The lists on `topic`, in the world of the truth; None: none of a known format is there. Raises RecordingError."""
     log = open_log(path).within(window)

@@ -8,7 +8,6 @@ this project wrote beside its own lists (`…/detail`) gives the full covariance
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from copem_replay.io.open import open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.registry import known_lists
+from copem_replay.io.together import Place
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write import osi_sensor_data as sensor_data
@@ -46,7 +46,7 @@ class _Rows:
     capture_said: list[bool] = field(default_factory=list)  # of every list
 
 
-def read_lists(path: Path, topic: str, scene: Scene) -> Tracks:
+def read_lists(path: Place, topic: str, scene: Scene) -> Tracks:
     """The lists on `topic`, their objects told by the ids of `scene` (−1 where the list names no object of it).
 
     Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
@@ -72,7 +72,7 @@ class RecordedLists:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def read_recorded(path: Path, topic: str, scene: Scene, window: Window | None = None) -> RecordedLists:
+def read_recorded(path: Place, topic: str, scene: Scene, window: Window | None = None) -> RecordedLists:
     """The lists on `topic` with all they say, but ids of the truth. Raises RecordingError as `read_lists`."""
     rows, _ = _all_rows(path, topic, window)
     stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
@@ -112,7 +112,7 @@ def read_recorded(path: Path, topic: str, scene: Scene, window: Window | None = 
     )
 
 
-def _all_rows(path: Path, topic: str, window: Window | None = None) -> tuple[_Rows, dict[int, dict[str, Any]]]:
+def _all_rows(path: Place, topic: str, window: Window | None = None) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     log = open_log(path).within(window)
     try:
         return _read(log, topic)
@@ -150,6 +150,11 @@ def _read(log: Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
             except DecodeError as error:
                 raise RecordingError(f"a message cannot be decoded: {error}", path=log.path, topic=topic) from None
             _add(rows, message, log_time_ns)
+            if chosen[number].ahead_ns:  # by the clock of the log times
+                by_message = message.HasField("timestamp"), message.HasField("last_measurement_time")
+                captured_ns, arrives_ns = rows.stamps[-1]
+                captured_ns -= chosen[number].ahead_ns * any(by_message)
+                rows.stamps[-1] = captured_ns, arrives_ns - chosen[number].ahead_ns * by_message[0]
             if max(map(abs, rows.stamps[-1])) > LAST_NS:
                 raise RecordingError("a message has an impossible time stamp", path=log.path, topic=topic)
     return rows, details

@@ -68,8 +68,8 @@ def recorded_unit(
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
     path, scene, window = recording.path, recording.scene, recording.window
-    found = read_listed(path, asked.topic, scene, recording.around, window)
-    found = found or read_recorded(path, asked.topic, scene, window)
+    found = read_listed(recording.place, asked.topic, scene, recording.around, window)
+    found = found or read_recorded(recording.place, asked.topic, scene, window)
     tracks = found.tracks
     if not len(tracks.stamp_ns):
         raise RecordingError(f"holds no list{' in the window' if window else ''}", path=path, topic=asked.topic)

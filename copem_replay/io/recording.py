@@ -19,11 +19,12 @@ from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.ground_truth import assemble
 from copem_replay.io.log import BrokenIndexError, Log
-from copem_replay.io.open import open_log
+from copem_replay.io.open import open_log, together_of
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import DecodedObjects
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
+from copem_replay.io.together import Place, Together
 from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
 
 if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
@@ -61,10 +62,21 @@ class Recording:
     world: str = ""  # name of the frame of reference of the truth, "": none is said, as by OSI
     window: Window | None = None  # of log time, that was read; None: all
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
+    together: Together | None = None  # the recordings of the drive, `path` being the first; None: it is one
+
+    @property
+    def place(self) -> Place:
+        """Where it lies: a file or folder, or several."""
+        return self.path if self.together is None else self.together
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files or folders it is read from."""
+        return (self.path,) if self.together is None else self.together.paths
 
 
 def read(
-    path: Path | str,
+    path: Place | str,
     *,
     name: str,
     ego: str | EgoTopic | None = None,
@@ -83,7 +95,8 @@ def read(
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several; EmptyWindowError.
     """
-    log = open_log(Path(path))
+    place = Path(path) if isinstance(path, str) else path
+    log = open_log(place)
     return read_log(log, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
 
 
@@ -127,7 +140,7 @@ def read_log(
     return Recording(
         scene, truth, log.path, topic, said_all, host, damage,
         around=around, encoding=encoding, world=world, window=log.window,
-        lane_boundaries=columns.lane_boundaries,
+        lane_boundaries=columns.lane_boundaries, together=together_of(log),
     )  # fmt: skip
 
 
@@ -186,6 +199,7 @@ def choose_topic(
         raise RecordingError(
             f"true objects on several topics, {_named(topics)}: choose one with `read: {{topic: …}}` in the experiment",
             path=log.path,
+            key=() if together_of(log) is None else ("together",),
         )
     poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
     return chosen, _ignored(log, chosen, topics, beside, poses_read=poses_read)
@@ -257,10 +271,10 @@ def _with_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
 
 def _decode(log: Log, topic: str) -> DecodedObjects:
     """All messages of the truth on a topic. Raises BrokenIndexError."""
-    schema_of = {c.number: c.schema for c in log.channels if c.topic == topic and is_truth(c)}
+    mine = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
     decoder = osi.Decoder()
-    for number, log_time_ns, payload in log.payloads(frozenset(schema_of)):
-        decoder.add(payload, schema=schema_of[number], log_time_ns=log_time_ns)
+    for number, log_time_ns, payload in log.payloads(frozenset(mine)):
+        decoder.add(payload, schema=mine[number].schema, log_time_ns=log_time_ns, ahead_ns=mine[number].ahead_ns)
     return decoder.columns()
 
 

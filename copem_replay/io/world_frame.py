@@ -106,7 +106,9 @@ def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> De
         lists = listed(definition, description, payloads, times)
     except (DefinitionError, FieldsError) as error:
         raise RecordingError(str(error), path=log.path, topic=channel.topic) from None
-    return replace(lists, columns=replace(lists.columns, notes=(*lists.columns.notes, *found.notes())))
+    columns = lists.columns
+    stamp_ns = columns.stamp_ns - np.where(columns.stamped, channel.ahead_ns, 0)
+    return replace(lists, columns=replace(columns, stamp_ns=stamp_ns, notes=(*columns.notes, *found.notes())))
 
 
 def in_world(found: DecodedLists, around: LogContext, path: Path, topic: str) -> DecodedLists:

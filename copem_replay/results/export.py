@@ -61,7 +61,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
     recording = run.recording
     return write_mcap(
         path,
-        recording.path,
+        recording.place,
         run.one.replay.scene,
         run.one.run_tracks,
         run.table,

@@ -14,8 +14,9 @@ import pandas as pd
 
 from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.file import Source, load, parse
+from copem_replay.experiment.file import Source, load, parse, places_of
 from copem_replay.experiment.schema import Experiment
+from copem_replay.io.together import Place, first_of
 from copem_replay.metrics.config import Measure
 from copem_replay.metrics.fixed import Fixed, fixed_in
 from copem_replay.results.belongings import MARK, check_still
@@ -190,11 +191,14 @@ class Results:
             if isinstance(one, dict):
                 yield str(name), one
 
+    def log_place(self, log: str) -> Place:
+        """Where the recording of a log, or the several that it is made of, are expected."""
+        entry = self.experiment.logs[[file.name for file in self.provenance.logs].index(log)]
+        return self.folder / entry if isinstance(entry, str) else places_of(entry, self.folder)[0]
+
     def log_path(self, log: str) -> Path:
         """Where the recording of a log is expected."""
-        number = [file.name for file in self.provenance.logs].index(log)
-        entry = self.experiment.logs[number]
-        return self.folder / (entry if isinstance(entry, str) else entry.file)
+        return first_of(self.log_place(log))
 
     def chosen(self, configurations: Sequence[str] | None) -> tuple[str, ...]:
         """The configurations to draw, each once; None: all. Raises InputError for a name that is not there."""

@@ -38,9 +38,9 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
     Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
     """
     file = next(file for file in results.provenance.logs if file.name == log)
-    path = results.log_path(log)
+    path, place = results.log_path(log), results.log_place(log)
     try:
-        found = sha256_of(path)
+        found = sha256_of(place)
     except RecordingError as error:
         raise RecordingError(f"{error}; put the log back to draw its runs") from None
     if found != file.sha256:
@@ -49,7 +49,7 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
             "put that log back, or run the experiment again",
             path=path,
         )
-    recordings, refused = read_logs(of_log(experiment, log), [path], None)
+    recordings, refused = read_logs(of_log(experiment, log), [place], None)
     if refused:
         raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
     # Draws are addressed by the log's name, which depends on what else was replayed.

@@ -20,7 +20,8 @@ from copem_replay.core.csv_names import for_spreadsheets
 from copem_replay.core.errors import OutputError
 from copem_replay.core.yaml import dump
 from copem_replay.experiment.drive import of_log
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.file import at_place
+from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import place_of
 from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
@@ -56,7 +57,7 @@ def write_results(
     `skipped`: recordings that are left out, and why.
     """
     with taken(folder, overwrite=overwrite) as place:
-        check_inputs(place, [recording.path for recording in recordings])
+        check_inputs(place, [path for recording in recordings for path in recording.paths])
         notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
         return place.notes + notes
 
@@ -108,7 +109,7 @@ def _fill(
 ) -> list[str]:
     """Write all files but the provenance. Returns notes for the user."""
     data, scratch = resolved(experiment).as_written(), place.new
-    data["logs"] = _entries(data["logs"], recordings, place.folder)
+    data["logs"] = _entries(experiment.logs, recordings, place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
     write_csv(result.summary, scratch / "summary.csv")
@@ -131,11 +132,15 @@ def _fill(
 
 def _entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
     """`logs` as the folder has it: a path relative to it each, with the log's settings where it has some."""
-    paths = [os.path.relpath(place_of(recording.path), folder) for recording in recordings]
-    settings = [entry for entry in logs if isinstance(entry, dict)]
+
+    def called(path: Path) -> str:
+        return os.path.relpath(place_of(path), folder)
+
+    settings = [entry for entry in logs if isinstance(entry, LogSettings)]
     if len(settings) < len(recordings):
-        return paths
-    return [entry | {"file": path} for entry, path in zip(settings, paths, strict=True)]
+        return [called(recording.path) for recording in recordings]
+    moved = (at_place(one, r.place, called) for one, r in zip(settings, recordings, strict=True))
+    return [one.model_dump(mode="json", by_alias=True) for one in moved]
 
 
 def _run_to_export(
@@ -182,7 +187,7 @@ def provenance_of(
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
-            {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.path)} for r in recordings
+            {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.place)} for r in recordings
         ],
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility.label,

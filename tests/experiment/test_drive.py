@@ -153,7 +153,10 @@ def test_latencies_of_absent_units_go_with_them(folder: Path) -> None:
             "2: logs[0].measure: runs: goes for all logs alike; "
             "a log has its own objects, onset, distance_to, annotated",
         ),
-        ("[{name: x}]", "2: logs[0].file: missing"),
+        (
+            "[{name: x}]",
+            "2: logs[0]: expected one of `file: <recording>` and `together: [<recording>, <recording>]`",
+        ),
         ("[{file: nix.mcap, ego: 1}, 'n*x']", "2: logs[1]: no file matches 'n*x'"),
         (
             "[{file: '*.mcap', name: x}]",

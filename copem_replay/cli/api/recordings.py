@@ -11,6 +11,8 @@ from copem_replay.io.recording import Recording
 from copem_replay.io.window import WindowSeconds
 
 if TYPE_CHECKING:  # of types alone
+    from collections.abc import Sequence
+
     from copem_replay.cli.api.study import AnyExperiment, AnyPath
     from copem_replay.experiment.draft.findings import Survey
     from copem_replay.io.config import EgoTopic
@@ -112,6 +114,31 @@ def encodable(path: AnyPath) -> None:
         str(path).encode()
     except UnicodeEncodeError:
         raise RecordingError(f"{path}: its path is not UTF-8: no experiment could name it") from None
+
+
+def draft_together(paths: Sequence[Path]) -> tuple[str | None, Survey]:
+    """The same of several recordings of one drive, with the offsets of their clocks as far as they can be told."""
+    from copem_replay.experiment.draft.clocks import clocks
+    from copem_replay.experiment.draft.survey import survey
+    from copem_replay.experiment.draft.template import commented, proposed, quoted
+    from copem_replay.io.together import Together
+
+    told = clocks(paths)
+    ahead_s = [0.0, *(0.0 if one.offset.untold else round(one.offset.offset_s, 3) for one in told)]
+    found = survey(Together(tuple(paths), tuple(ahead_s)))
+    text = commented(found) if found.readable else proposed(found)
+    if text is None:
+        return None, found
+    entry = [
+        "logs:   # relative to this file, or absolute",
+        f"  - together: [{', '.join(quoted(str(p)) for p in paths)}]",
+    ]
+    entry += ["    clock_offset_s:   # how far a clock is ahead of the first one's; it is subtracted"]
+    for one, offset_s in zip(told, ahead_s[1:], strict=True):
+        entry.append(f"      {quoted(str(one.path))}: {offset_s}   # {one.words()}; by {' and '.join(one.lists)}")
+    lines = text.splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("logs: ["))
+    return "\n".join([*lines[:at], *entry, *lines[at + 1 :]]) + "\n", found
 
 
 def draft_of(path: Path) -> tuple[str | None, Survey]:

@@ -99,7 +99,7 @@ class StudyResult:
         from copem_replay.results.place import check_inputs, taken
 
         with taken(Path(folder), overwrite=overwrite) as place:
-            check_inputs(place, [recording.path for recording in self.recordings])
+            check_inputs(place, [path for recording in self.recordings for path in recording.paths])
             fill(place, self)
             self.folder = place.shown
         return place.shown

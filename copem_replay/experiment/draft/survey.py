@@ -30,6 +30,7 @@ from copem_replay.io.recording import Recording, choose_topic, foreign, is_truth
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list
+from copem_replay.io.together import Place, first_of
 
 if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
     from copem_replay.io.recorded_osi import RecordedLists
@@ -41,11 +42,14 @@ _OURS = "copem/"  # what this project wrote beside a recording
 _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"
 
 
-def survey(path: Path | str) -> Survey:
+def survey(place: Place | str) -> Survey:
     """Look at a recording: the same findings for the same bytes. A bad recording raises nothing."""
-    found = Survey(recording=Path(path).name or str(path), log=str(path))
+    place = Path(place) if isinstance(place, str) else place
+    path = first_of(place)
+    names = [path] if isinstance(place, Path) else list(place.paths)
+    found = Survey(recording=" + ".join(one.name or str(one) for one in names), log=str(place))
     try:
-        log = open_log(Path(path))
+        log = open_log(place)
     except RecordingError as error:
         return replace(found, reason=str(error))
     found = replace(found, damage=log.damage, topics=_topics(log))
@@ -60,7 +64,7 @@ def survey(path: Path | str) -> Survey:
     beside = [t.topic for t in found.topics if t.role == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=name_of(Path(path)), topic=topic, beside=beside)
+            recording = read_log(log, name=name_of(path), topic=topic, beside=beside)
         except RecordingError as error:
             failures.append(str(error))
             continue
@@ -134,10 +138,10 @@ def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:
     if of_osi:
         from copem_replay.io.recorded_osi import read_recorded
 
-        return read_recorded(recording.path, topic, recording.scene)
+        return read_recorded(recording.place, topic, recording.scene)
     from copem_replay.io.recorded_lists import read_listed
 
-    found = read_listed(recording.path, topic, recording.scene, recording.around)
+    found = read_listed(recording.place, topic, recording.scene, recording.around)
     if found is None:
         raise RecordingError("holds no list", path=recording.path, topic=topic)
     return found

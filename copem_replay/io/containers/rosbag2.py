@@ -7,7 +7,6 @@ cannot be read at all is left out, and it is said.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from mcap.records import Message
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.text import counted
 from copem_replay.io.channel import Channel
+from copem_replay.io.containers.in_order import merged
 from copem_replay.io.containers.mcap_indexed import renumbered
 from copem_replay.io.containers.rosbag2_metadata import files_of, unnamed_in
 from copem_replay.io.log import BrokenIndexError, Log, from_start, open_mcap
@@ -133,21 +133,3 @@ def _and(one: Channel, other: Channel) -> Channel:
 def _of_file(path: Path, error: RecordingError) -> str:
     """What is wrong with a file of the folder, under its own name."""
     return f"{path.name}: {'; '.join(error.within(path))}"
-
-
-def merged(streams: Sequence[tuple[int, Callable[[], Iterator[Message]]]]) -> Iterator[Message]:
-    """Messages of several streams, each in order of log time, in one: (when it begins, how it is opened)."""
-    waiting: list[tuple[int, int, Message | None]] = [(start, k, None) for k, (start, _) in enumerate(streams)]
-    heapq.heapify(waiting)
-    running: dict[int, Iterator[Message]] = {}
-    while waiting:
-        _, k, message = waiting[0]
-        if message is None:
-            running[k] = streams[k][1]()
-        else:
-            yield message
-        if (following := next(running[k], None)) is None:
-            heapq.heappop(waiting)
-            del running[k]
-        else:
-            heapq.heapreplace(waiting, (following.log_time, k, following))

@@ -88,8 +88,11 @@ class Decoder:
         self._lane_boundaries: list[Float] = []
         self._notes: Counter[tuple[str, str]] = Counter()  # what is counted, and what is the matter with it
 
-    def add(self, payload: bytes, *, schema: str, log_time_ns: int) -> None:
-        """Take in a message of `schema`, one of `TRUTH_SCHEMAS`; what is none is skipped and noted."""
+    def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
+        """Take in a message of `schema`, one of `TRUTH_SCHEMAS`; what is none is skipped and noted.
+
+        `ahead_ns`: of the clock of its stamp, against that of the log times.
+        """
         try:
             message = self._message_of[schema].FromString(payload)
         except DecodeError:
@@ -109,7 +112,7 @@ class Decoder:
         if abs(seconds) > _LAST_SECOND:
             self._notes["message", "with an impossible time stamp: skipped"] += 1
             return
-        self._stamp_ns.append(seconds * 1_000_000_000 + nanos)
+        self._stamp_ns.append(seconds * 1_000_000_000 + nanos - (0 if stamped is None else ahead_ns))
         self._stamped.append(stamped is not None)
         self._add_host(message, truth)
         if not self._lane_boundaries and len(truth.lane_boundary):  # said once, or again in every message

@@ -47,7 +47,8 @@ def poses_of(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) -> P
     texts = [np.array([*level.texts[n].words, ""], dtype=object)[level.texts[n].code] for n in names]
     parts = [level.texts[s] for s in stamps]
     seconds = [np.array([*(_whole(w) for w in part.words), 0], dtype=np.int64)[part.code] for part in parts]
-    stamp_ns = seconds[0] * 1_000_000_000 + seconds[1] if len(seconds) == 2 else log_time_ns[message]
+    said = len(seconds) == 2
+    stamp_ns = seconds[0] * 1_000_000_000 + seconds[1] - channel.ahead_ns if said else log_time_ns[message]
     with np.errstate(invalid="ignore", over="ignore"):
         length = np.linalg.norm(columns[:, 3:7], axis=1)
         near = (np.abs(columns[:, :3]) <= _FARTHEST_M).all(axis=1)

@@ -6,18 +6,22 @@ once. A trace becomes a channel.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from importlib.metadata import version
-from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from mcap.records import Channel, Message
 
+from copem_replay.io.containers.in_order import merged
+from copem_replay.io.containers.joined import Joined, JoinedPart, moved_back, named
 from copem_replay.io.containers.mcap_indexed import renumbered
 from copem_replay.io.containers.osi_trace import Trace, message_class
-from copem_replay.io.containers.rosbag2 import Bag, merged
+from copem_replay.io.containers.rosbag2 import Bag
+from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
+from copem_replay.io.together import AHEAD, Place
 from copem_replay.io.window import Window
 from copem_replay.io.write.message_family import OSI_CHANNEL, osi_version
 from copem_replay.io.write.pass_through import Catalogue, Original
@@ -38,9 +42,14 @@ class Source(Protocol):
         """The messages in order of log time, with the channel numbers of the output."""
 
 
-def source_of(path: Path, window: Window | None = None) -> Source:
+def source_of(path: Place, window: Window | None = None) -> Source:
     """What can be copied of a recording, or of a window of it. Raises RecordingError where nothing can be read."""
-    log = open_log(path).within(window)
+    return _source(open_log(path).within(window))
+
+
+def _source(log: Log) -> Source:
+    if isinstance(log, Joined):
+        return _OfJoined(log)
     if isinstance(log, Bag):
         return _OfBag(log)
     return _OfTrace(log) if isinstance(log, Trace) else Original(log)
@@ -72,6 +81,62 @@ class _OfBag:
         return merged(
             [(f.start_ns, partial(f.messages, mine)) for f, mine in zip(self._files, of_file, strict=True) if mine]
         )
+
+
+class _Named:
+    """A catalogue into which a recording of several puts its channels: topics told apart, the clock said."""
+
+    def __init__(self, catalogue: Catalogue, part: JoinedPart, several: Collection[str]) -> None:
+        self._catalogue, self._part, self._several = catalogue, part, several
+        self.schema, self.attach = catalogue.schema, catalogue.attach
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        ahead_ns = self._part.ahead_ns + int(metadata.get(AHEAD, "0"))
+        said = metadata | ({AHEAD: str(ahead_ns)} if ahead_ns else {})
+        topic = named(topic, self._part.label) if topic in self._several else topic
+        return self._catalogue.channel(topic, encoding, schema, said)
+
+
+class _OfJoined:
+    def __init__(self, log: Joined) -> None:
+        self._parts = log.parts
+        self._files = [_source(part.log) for part in log.parts]
+        profiles = {file.profile for file in self._files}
+        self.profile = profiles.pop() if len(profiles) == 1 else ""
+        self.metadata: dict[str, dict[str, str]] = {}
+        for file in self._files:
+            for name, record in file.metadata.items():
+                self.metadata.setdefault(name, {}).update(record)
+        counts = Counter(topic for file in self._files for topic in {c.topic for c in file.channels.values()})
+        self._several = {topic for topic, count in counts.items() if count > 1}
+        every = [(k, number, c) for k, file in enumerate(self._files) for number, c in file.channels.items()]
+        self._place = {place: (k, number) for place, (k, number, _) in enumerate(every)}
+        self.channels = {place: channel for place, (_, _, channel) in enumerate(every)}
+        self.damage = next((file.damage for file in self._files if file.damage), None)
+
+    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
+        numbers = [
+            file.register(cast("Catalogue", _Named(catalogue, part, self._several)), without)
+            for file, part in zip(self._files, self._parts, strict=True)
+        ]
+        return {place: numbers[k][n] for place, (k, n) in self._place.items() if n in numbers[k]}
+
+    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
+        of_file: list[dict[int, int]] = [{} for _ in self._files]
+        for place, number in numbers.items():
+            k, theirs = self._place[place]
+            of_file[k][theirs] = number
+        return merged(
+            [
+                (part.log.start_ns - part.ahead_ns, partial(_moved, file, mine, part.ahead_ns))
+                for file, part, mine in zip(self._files, self._parts, of_file, strict=True)
+                if mine
+            ]
+        )
+
+
+def _moved(file: Source, numbers: Mapping[int, int], ahead_ns: int) -> Iterator[Message]:
+    return (moved_back(message, message.channel_id, ahead_ns) for message in file.messages(numbers))
 
 
 class _OfTrace:

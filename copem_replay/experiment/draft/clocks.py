@@ -1,0 +1,93 @@
+"""How far the clocks of several recordings of one drive are apart, by the traffic that they have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from copem_replay.core.errors import RecordingError
+from copem_replay.core.tracks import Scene
+from copem_replay.io.containers.joined import labels_of
+from copem_replay.io.log import Log
+from copem_replay.io.open import open_log
+from copem_replay.io.recorded_lists import read_listed
+from copem_replay.io.recorded_osi import read_recorded
+from copem_replay.io.recording import read_log, truth_topics
+from copem_replay.io.schemas.registry import known_lists
+from copem_replay.io.short_tracks import Entries, entries_of
+from copem_replay.io.time_offset import TimeOffset, time_offset
+
+_OURS = "copem/"  # what this project wrote beside a recording
+
+
+@dataclass(frozen=True)
+class ClockFound:
+    """What is told of the clock of a recording against the first one's: by which two lists; `offset`: the best."""
+
+    path: Path
+    lists: tuple[str, str]
+    offset: TimeOffset
+
+    def words(self) -> str:
+        """`0.130 s (95 %: 0.120 … 0.140 s)` and the drift, or that it cannot be told."""
+        found = self.offset
+        if found.untold is not None:
+            return f"cannot be told: {found.untold}"
+        said = f"{found.offset_s:.3f} s (95 %: {found.low_s:.3f} … {found.high_s:.3f} s)"
+        if found.unbiased:
+            said += ", if no entry is shifted along its way"
+        if found.drift is not None:
+            drift, low, high = (1e6 * value for value in found.drift)
+            said += f", drift {drift:.0f} µs/s (95 %: {low:.0f} … {high:.0f})"
+        return said
+
+
+@dataclass(frozen=True)
+class _Lists:
+    name: str
+    entries: Entries
+
+
+def clocks(paths: Sequence[Path]) -> list[ClockFound]:
+    """The clock of each recording but the first. Raises RecordingError: one cannot be read, or has no object list."""
+    t0_ns: int | None = None
+    every: list[list[_Lists]] = []
+    for path, label in zip(paths, labels_of(paths), strict=True):
+        log = open_log(path)
+        t0_ns = log.start_ns if t0_ns is None else t0_ns
+        mine = list(_lists(log, label, t0_ns))
+        if not mine:
+            raise RecordingError("no object list to tell its clock by", path=path)
+        every.append(mine)
+    return [_best(path, every[0], mine) for path, mine in zip(paths[1:], every[1:], strict=True)]
+
+
+def _best(path: Path, first: Sequence[_Lists], mine: Sequence[_Lists]) -> ClockFound:
+    """What the two lists tell whose interval is narrowest."""
+    found = [ClockFound(path, (a.name, b.name), time_offset(a.entries, b.entries)) for a, b in product(first, mine)]
+    return min(found, key=lambda one: (one.offset.untold is not None, one.offset.high_s - one.offset.low_s))
+
+
+def _lists(log: Log, label: str, t0_ns: int) -> Iterator[_Lists]:
+    """The object lists of a recording, truths first, in seconds since an instant. What cannot be read is none."""
+    for topic in truth_topics(log):
+        try:
+            truth = read_log(log, name=label, topic=topic).truth
+        except RecordingError:
+            continue
+        yield _Lists(f"{label}:{topic}", entries_of(truth, t0_ns))
+    scene = Scene(label, t0_ns, log.end_ns, (), np.empty(0, dtype=np.int8), np.empty(0, dtype=bool))
+    osis = [c.topic for c in log.channels if c.schema == "osi3.SensorData" and c.messages]
+    others = [c.topic for c in known_lists(log.channels) if c.messages and c.topic not in truth_topics(log)]
+    for topic in dict.fromkeys([*osis, *others]):
+        try:
+            found = None if topic in osis else read_listed(log.path, topic, scene, None)
+            found = found or read_recorded(log.path, topic, scene)
+        except RecordingError:
+            continue
+        if not topic.startswith(_OURS) and len(found.tracks.frame_ix):
+            yield _Lists(f"{label}:{topic}", entries_of(found.tracks, t0_ns, found.track_id))

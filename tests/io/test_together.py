@@ -1,0 +1,244 @@
+"""Several recordings of one drive as one log. The oracle: the same messages in one file, by one clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pandas.testing import assert_frame_equal
+from typer.testing import CliRunner
+
+import copem_replay as cr
+from copem_replay.cli.main import app
+from copem_replay.experiment.draft.clocks import clocks
+from copem_replay.io.containers.joined import labels_of
+from copem_replay.io.open import open_log
+from copem_replay.io.recorded_osi import read_recorded
+from copem_replay.io.recording import read
+from copem_replay.io.together import Together
+from copem_replay.io.window import Window
+from tests.experiment.test_validate import against_logs, without_logs
+from tests.helpers.experiments import changed
+from tests.helpers.recordings import Obj, Topic, ns, truth_topic, write_mcap
+from tests.io.test_recorded_units import car, list_of
+
+AHEAD_S = 0.375
+FRAMES = [(10 + 0.1 * k, [Obj(id=1), Obj(id=2, x=70.0 - k, vx=-10.0)]) for k in range(40)]
+
+
+def rsu(ahead_s: float, name: str = "objects") -> Topic:
+    lists = [list_of(10.05 + 0.1 * k + ahead_s, car(69.5 - k, vx=-10.0)) for k in range(38)]
+    return Topic(name, "osi3.SensorData", lists)
+
+
+def ego_topics() -> list[Topic]:
+    """The truth, and a topic of the ego's that has the name of the unit's."""
+    own = [list_of(10 + 0.2 * k, car(70.0 - 2 * k, y=0.5, vx=-10.0)) for k in range(20)]
+    return [truth_topic(FRAMES, name="truth", host=1), Topic("objects", "osi3.SensorData", own)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_mcap(tmp_path / "ego.mcap", ego_topics())
+    write_mcap(tmp_path / "rsu.mcap", [rsu(AHEAD_S)])
+    truth, own = ego_topics()
+    both = [truth, Topic("ego:objects", own.schema, own.messages), rsu(0.0, "rsu:objects")]
+    write_mcap(tmp_path / "drive.mcap", both)
+    return tmp_path
+
+
+def place(folder: Path, ahead_s: float = AHEAD_S) -> Together:
+    return Together((folder / "ego.mcap", folder / "rsu.mcap"), (0.0, ahead_s))
+
+
+PLAN: dict[str, Any] = {
+    "version": 1,
+    "runs": 1,
+    "units": {
+        name: {"recorded": {"topic": f"{name}:objects", "covariance_m2": [[0.2, 0], [0, 0.2]]}}
+        for name in ("ego", "rsu")
+    },
+    "configurations": {"both": {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}},
+    "measure": {"onset": {"kind": "appears"}},
+}
+
+
+def plan(folder: Path, entry: Any) -> dict[str, Any]:
+    return PLAN | {"logs": [entry]}
+
+
+def joint(folder: Path, ahead_s: float = AHEAD_S) -> dict[str, Any]:
+    paths = [str(folder / "ego.mcap"), str(folder / "rsu.mcap")]
+    return {"together": paths, "clock_offset_s": {paths[1]: ahead_s}, "name": "drive"}
+
+
+def test_messages_come_in_order_of_time_and_topics_are_told_apart(folder: Path) -> None:
+    log = open_log(place(folder))
+    assert {c.topic for c in log.channels} == {"truth", "ego:objects", "rsu:objects"}
+    one = open_log(folder / "drive.mcap")
+    topics = [{c.number: c.topic for c in each.channels} for each in (log, one)]
+    found, expected = (
+        sorted((t, of[n]) for n, t, _ in each.payloads(frozenset(of)))
+        for each, of in zip((log, one), topics, strict=True)
+    )
+    assert found == expected
+    times = [t for _, t, _ in log.payloads(frozenset(topics[0]))]
+    assert times == sorted(times)
+
+
+def test_lists_are_by_the_first_clock(folder: Path) -> None:
+    recording = read(place(folder), name="drive")
+    assert recording.path == folder / "ego.mcap"
+    found, expected = (
+        read_recorded(at, "rsu:objects", recording.scene).tracks for at in (place(folder), folder / "drive.mcap")
+    )
+    assert np.array_equal(found.stamp_ns, expected.stamp_ns)
+    assert np.array_equal(found.arrives_s, expected.arrives_s)
+
+
+@pytest.mark.parametrize("window_s", [None, [1, 3]])
+def test_a_drive_comes_out_as_from_one_file(folder: Path, window_s: list[float] | None) -> None:
+    whole = plan(folder, {"file": str(folder / "drive.mcap"), "name": "drive"}) | {"window_s": window_s}
+    expected = cr.run(whole, jobs=1).detections
+    assert len(expected)
+    found = cr.run(plan(folder, joint(folder)) | {"window_s": window_s}, jobs=1).detections
+    assert_frame_equal(found, expected)
+
+
+def test_what_is_written_is_one_file_that_replays_as_the_drive_did(folder: Path) -> None:
+    result = cr.run(plan(folder, joint(folder)), jobs=1)
+    result.save(folder / "out")
+    again = cr.run(plan(folder, {"file": str(folder / "out/replay.mcap"), "name": "drive"}), jobs=1)
+    assert_frame_equal(again.detections, result.detections)
+    saved = cr.run(folder / "out/experiment.yaml", jobs=1)
+    assert_frame_equal(saved.detections, result.detections)
+    written = open_log(folder / "out/replay.mcap")
+    assert {c.ahead_ns for c in written.channels if c.topic == "rsu:objects"} == {ns(AHEAD_S)}
+    times = [t for _, t, _ in written.payloads(frozenset(c.number for c in written.channels))]
+    assert times == sorted(times)
+
+
+def test_nothing_is_moved_unasked(folder: Path) -> None:
+    recording = read(place(folder, 0.0), name="drive")
+    found = read_recorded(place(folder, 0.0), "rsu:objects", recording.scene).tracks
+    assert found.stamp_ns[0] == ns(10.05 + AHEAD_S)
+
+
+def test_a_window_is_by_the_first_clock(folder: Path) -> None:
+    log = open_log(place(folder)).within(Window(ns(11), ns(12)))
+    times = [t for _, t, _ in log.payloads(frozenset(c.number for c in log.channels))]
+    assert ns(11) <= min(times)
+    assert max(times) <= ns(12)
+    assert len(times) == 11 + 6 + 10  # truth, the ego's lists, the unit's
+
+
+def test_labels_are_as_long_as_they_need_to_be(tmp_path: Path) -> None:
+    assert labels_of([tmp_path / "ego.mcap", tmp_path / "rsu.mcap"]) == ["ego", "rsu"]
+    assert labels_of([tmp_path / "a/x.mcap", tmp_path / "b/x.mcap"]) == ["a/x", "b/x"]
+
+
+def traffic(folder: Path, ahead_s: float) -> tuple[Path, Path]:
+    """Two cars at varying speeds by the truth, and by a unit with errors of half a metre and a clock of its own."""
+    rng = np.random.default_rng(2)
+
+    def along(t: float) -> tuple[float, float]:
+        return 8 * t - 4 * np.cos(t), 8 + 4 * np.sin(t)
+
+    frames, lists = [], []
+    for k in range(400):
+        x, v = along(0.05 * k)
+        frames.append((100 + 0.05 * k, [Obj(id=1, x=x, vx=v), Obj(id=2, x=-x, y=9, vx=-v)]))
+    for k in range(3, 180):
+        x, v = along(0.1 * k)
+        east, north = rng.normal(0, 0.5, (2, 2))
+        entries = car(x + east[0], north[0], vx=v), car(-x + east[1], 9 + north[1], vx=-v)
+        lists.append(list_of(100 + 0.1 * k + ahead_s, *entries))
+    ego = write_mcap(folder / "ego.mcap", [truth_topic(frames, name="truth", host=1)])
+    return ego, write_mcap(folder / "rsu.mcap", [Topic("objects", "osi3.SensorData", lists)])
+
+
+class TestClocks:
+    def test_info_tells_the_offset_and_init_writes_it(self, tmp_path: Path) -> None:
+        logs = [str(path) for path in traffic(tmp_path, -0.4)]
+        (found,) = clocks([Path(log) for log in logs])
+        assert found.lists == ("ego:truth", "rsu:objects")
+        assert found.offset.low_s < -0.4 < found.offset.high_s
+        assert found.offset.offset_s == pytest.approx(-0.4, abs=0.02)
+        told = CliRunner().invoke(app, ["info", *logs, "--together"], standalone_mode=False)
+        assert told.return_value == 0
+        assert f"clock_offset_s against {logs[0]}: {found.words()}" in told.output.replace("\n", " ")
+        drafted = CliRunner().invoke(app, ["init", *logs, "--together"], standalone_mode=False).output
+        assert f"{round(found.offset.offset_s, 3)}   # {found.words()}" in drafted
+        (tmp_path / "experiment.yaml").write_text(drafted)
+        (study,) = cr.load_experiment(tmp_path / "experiment.yaml").logs
+        assert not isinstance(study, str)
+        assert study.together == tuple(logs)
+
+    def test_one_recording_has_nothing_to_be_ahead_of(self, folder: Path) -> None:
+        found = CliRunner().invoke(app, ["info", str(folder / "ego.mcap"), "--together"], standalone_mode=False)
+        assert isinstance(found.exception, cr.InputError)
+        assert str(found.exception) == "--together: expected several recordings of one drive, found 1"
+
+    def test_what_cannot_be_told_is_said(self, folder: Path) -> None:
+        write_mcap(folder / "rsu.mcap", [Topic("objects", "osi3.SensorData", rsu(0.0).messages[:3])])
+        (found,) = clocks([folder / "ego.mcap", folder / "rsu.mcap"])
+        assert found.words().startswith("cannot be told: ")
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("entry", "expected"),
+        [
+            ("{together: [ego.mcap]}", "2: logs[0].together: expected at least 2 in the list, found ['ego.mcap']"),
+            (
+                "{together: [ego.mcap, rsu.mcap], file: ego.mcap}",
+                "2: logs[0]: expected one of `file: <recording>` and `together: [<recording>, <recording>]`",
+            ),
+            (
+                "{together: [ego.mcap, ego.mcap]}",
+                "2: logs[0]: together: expected each recording once, found 'ego.mcap' twice",
+            ),
+            (
+                "{together: [ego.mcap, rsu.mcap], clock_offset_s: {mast.mcap: 1}}",
+                "2: logs[0]: clock_offset_s: expected a recording of `together` (rsu.mcap), found 'mast.mcap'",
+            ),
+            (
+                "{together: [ego.mcap, rsu.mcap], clock_offset_s: {ego.mcap: 1}}",
+                "2: logs[0]: clock_offset_s: 'ego.mcap' is the first, by whose clock the others are ahead",
+            ),
+        ],
+    )
+    def test_by_its_shape(self, folder: Path, entry: str, expected: str) -> None:
+        assert without_logs(folder, changed(f"logs: [{entry}]")) == [expected]
+
+    def test_an_offset_beyond_the_overlap(self, folder: Path) -> None:
+        entry = "{together: [ego.mcap, rsu.mcap], clock_offset_s: {rsu.mcap: 60}}"
+        assert against_logs(folder, changed(f"logs: [{entry}]")) == [
+            "2: logs[0].clock_offset_s: ego.mcap: rsu.mcap: with 60 s the offset is beyond the overlap: expected a "
+            "time in common with ego.mcap, found 55.875 s between them"
+        ]
+
+    def test_files_that_do_not_overlap(self, folder: Path) -> None:
+        write_mcap(folder / "rsu.mcap", [rsu(100.0)])
+        assert against_logs(folder, changed("logs: [{together: [ego.mcap, rsu.mcap]}]")) == [
+            "2: logs[0].together: ego.mcap: rsu.mcap: expected a time in common with ego.mcap, found 96.150 s between "
+            "them"
+        ]
+
+    def test_a_file_that_is_not_there(self, folder: Path) -> None:
+        assert against_logs(folder, changed("logs: [{together: [ego.mcap, gone.mcap]}]")) == [
+            "2: logs[0]: gone.mcap: no such file"
+        ]
+
+    def test_two_truths(self, folder: Path) -> None:
+        write_mcap(folder / "rsu.mcap", [truth_topic(FRAMES, name="truth")])
+        entry = "{together: [ego.mcap, rsu.mcap]}"
+        (line,) = against_logs(folder, changed(f"logs: [{entry}]"))
+        assert line.startswith(
+            "2: logs[0].together: ego.mcap: true objects on several topics, ego:truth (osi3.GroundTruth), rsu:truth"
+        )
+        assert line.endswith("choose one with `read: {topic: …}` in the experiment")
+        chosen = entry.replace("}", ", read: {topic: 'rsu:truth'}, ego: 1}")
+        assert against_logs(folder, changed(f"logs: [{chosen}]")) == []
