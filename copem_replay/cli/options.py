@@ -9,9 +9,6 @@ import typer
 
 ExperimentFile: TypeAlias = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (YAML).")]
 ResultsFolder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder.")]
-LogFile: TypeAlias = Annotated[
-    Path, typer.Argument(metavar="LOG", help="Recording: MCAP file, rosbag2 folder, .osi file.")
-]
 LogFiles: TypeAlias = Annotated[
     list[Path], typer.Argument(metavar="LOG", help="Recordings: MCAP files, rosbag2 folders, .osi files.")
 ]
