@@ -28,7 +28,8 @@ _MARK_M, _ABOVE_M = 0.5, 0.05
 
 def truth_scene(one: OneRun, table: pd.DataFrame) -> TruthScene:
     """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
-    fixed = [name for name, unit in one.experiment.modelled.items() if unit.at is not None]
+    stamps_ns = one.replay.placed.stamps_ns
+    fixed = [name for name, unit in one.experiment.modelled.items() if unit.at is not None and len(stamps_ns[name])]
     units = [_unit(one, name, _pose(one.replay.placed.poses[name], 0)) for name in fixed]
     follow = EGO_FRAME if one.replay.scene.ego_ix >= 0 else MIDDLE_FRAME
     return TruthScene([*_statics(one), *units], _Frames(one, named(table)), follow)
