@@ -182,6 +182,8 @@ def _settings(source: Source, data: dict[str, Any], units: Sequence[str], pems: 
 
 
 def _configuration(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+    if configuration.get("recorded") is not None:
+        yield from _inputs(source, key, configuration, units)
     chosen = configuration.get("units")
     if chosen == "all" and not _modelled(source.data):
         which = "modelled units; recorded ones are named" if units else "units"
@@ -198,6 +200,22 @@ def _configuration(source: Source, key: Key, configuration: dict[str, Any], unit
     for unit in latency if isinstance(latency, dict) else ():
         if unit not in [*units, "default", "truth"]:
             yield source.at((*key, "latency_s", unit), unknown("unit", unit, [*units, "default"]))
+
+
+def _inputs(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:
+    """What a stack had, and cannot have had."""
+    given, modelled = configuration.get("inputs"), _modelled(source.data)
+    inputs = given if isinstance(given, list) else []
+    for k, unit in enumerate(inputs):
+        if _is_name(unit) and str(unit) not in units:
+            yield source.at((*key, "inputs", k), unknown("unit", unit, units))
+        elif str(unit) in modelled:
+            yield source.at((*key, "inputs", k), f"unit {str(unit)!r} has a PEM; a stack had what was `recorded`")
+        elif unit in inputs[:k]:
+            yield source.at((*key, "inputs", k), f"unit {str(unit)!r} named twice")
+    measure = source.data.get("measure")
+    if isinstance(measure, dict) and measure.get("exact") is True:
+        yield source.at(("measure", "exact"), f"configuration {key[-1]!r}: a recorded output has no exact times")
 
 
 def _fusion(source: Source, key: Key, configuration: dict[str, Any], chosen: object) -> Iterator[str]:

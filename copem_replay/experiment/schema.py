@@ -6,6 +6,7 @@ are checked in `experiment/validate.py`, which reports all problems of a file at
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -26,7 +27,7 @@ from copem_replay.core.components import Count, Frozen, Id, Latency, Number, Pos
 from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
-from copem_replay.io.config import Ego, HowRead, Read, Recorded, WindowOf
+from copem_replay.io.config import Ego, HowRead, Read, Recorded, RecordedOutput, WindowOf
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement
 from copem_replay.perception.pem.model import Pem
@@ -107,16 +108,38 @@ class Unit(Placement):
 class Configuration(Frozen):
     """What is compared: which units, which fusion, which latency, by unit or not, or which `link` of the user's own.
 
+    Or a stack's `recorded` output, and the recorded units it had as `inputs`: ideal fusion of these is what its regret
+    is to.
+
     >>> late = cr.Configuration(units="all", latency_s={"ego": 0.0, "default": 0.15}, fusion={"kind": "gnn"})
     >>> late.latency_of("mast"), late.fusion.kind
     (0.15, 'gnn')
     """
 
-    units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)]
+    units: Literal["truth", "all"] | Annotated[tuple[Id, ...], Field(min_length=1)] = ()
+    recorded: RecordedOutput | None = None
+    inputs: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
     latency_s: Latency | dict[Id, Latency] = 0.0
     link: Annotated[LinkModel, Slot("link", {})] | None = Field(default=None, exclude_if=lambda link: link is None)
     max_age_s: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _what(self) -> Self:
+        if self.recorded is None:
+            if not self.units:
+                raise ValueError("units: missing (or `recorded: {topic: …}`, a stack's own output)")
+            if self.inputs is not None:
+                raise ValueError("inputs: what a `recorded` output was made of; other configurations have `units`")
+        elif beside := sorted(self.model_fields_set - {"recorded", "inputs"}):
+            raise ValueError(f"recorded: nothing is made of it, so it goes without {', '.join(beside)}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, dump: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        """A recorded output without what does not go with it, any other configuration without what only that has."""
+        output = self.recorded is not None
+        return {k: v for k, v in dump(self).items() if (k in ("recorded", "inputs")) == output and (v or not output)}
 
     @model_validator(mode="after")
     def _one_link(self) -> Self:
@@ -186,6 +209,32 @@ class LogSettings(Frozen):
         """Only keys that are given: a `null` would be one, too."""
         written: dict[str, Any] = write(self)
         return {key: value for key, value in written.items() if key in self.model_fields_set}
+
+
+def output_unit(configuration: str) -> str:
+    """What the unit is called that stands for the recorded output of a configuration."""
+    return f"{configuration} (recorded)"
+
+
+def ideal_over(configurations: Mapping[str, Configuration], inputs: Sequence[str]) -> str | None:
+    """The configuration that is ideal fusion of these very units without latency; None: there is none."""
+    for name, one in configurations.items():
+        alike = one.recorded is None and not isinstance(one.units, str) and set(one.units) == set(inputs)
+        if alike and one.fusion == Ideal() and one.link is None and not one.latency_s:
+            return name
+    return None
+
+
+def _with_ideals(configurations: dict[str, Configuration]) -> dict[str, Configuration]:
+    """Beside each recorded output ideal fusion of its inputs, `<name>:ideal`, where there is none yet."""
+    result = dict(configurations)
+    for name, one in configurations.items():
+        if one.inputs is None or ideal_over(result, one.inputs) is not None:
+            continue
+        if f"{name}:ideal" in result:
+            raise ValueError(f"{name}:ideal: expected ideal fusion of the inputs of {name}, found another; rename it")
+        result[f"{name}:ideal"] = Configuration(units=one.inputs)
+    return result
 
 
 def _what_log(value: object) -> str:
@@ -261,6 +310,11 @@ class Experiment(Frozen):
     sweep: Sweep | None = None
     show: Show | None = Show()
 
+    @field_validator("configurations", mode="after")
+    @classmethod
+    def _ideals(cls, configurations: dict[str, Configuration]) -> dict[str, Configuration]:
+        return _with_ideals(configurations)
+
     @property
     def modelled(self) -> dict[str, Unit]:
         """The units that have a PEM."""
@@ -271,8 +325,13 @@ class Experiment(Frozen):
         """The units whose lists are recorded in the log."""
         return {name: unit.recorded for name, unit in self.units.items() if unit.recorded is not None}
 
+    @property
+    def outputs(self) -> dict[str, RecordedOutput]:
+        """The recorded outputs of stacks, by configuration."""
+        return {name: one.recorded for name, one in self.configurations.items() if one.recorded is not None}
+
     def units_of(self, configuration: Configuration) -> tuple[str, ...]:
-        """Names of the units of a configuration, in the experiment's order; none for the truth."""
+        """Names of the units of a configuration, in the experiment's order; none for the truth and a stack's output."""
         if configuration.units == "truth":
             return ()
         if configuration.units == "all":

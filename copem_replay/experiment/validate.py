@@ -25,10 +25,11 @@ from copem_replay.experiment.file import (
     parse,
     places_of,
 )
-from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.experiment.shape_problems import by_key
 from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of
+from copem_replay.io.recorded_output import recorded_output
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
 from copem_replay.io.together import Place, Together, first_of
@@ -179,7 +180,7 @@ def _read(experiment: Experiment, place: Place) -> tuple[Recording | None, list[
     ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
     wrong: list[Refused] = []
     fields = experiment.read if isinstance(experiment.read, ReadFields) else None
-    beside = {asked.topic for asked in experiment.recorded.values()}
+    beside = {asked.topic for asked in (*experiment.recorded.values(), *experiment.outputs.values())}
     how = partial(
         read, place, name=name_of(path), topic=experiment.read.topic, fields=fields, beside=beside,
         window_s=experiment.window_s,
@@ -202,6 +203,15 @@ def _read(experiment: Experiment, place: Place) -> tuple[Recording | None, list[
             notes += said
         except RecordingError as error:
             at = ("units", name, "recorded")
+            wrong += [Refused(path, line, at) for line in error.within(path)]
+    for name, output in experiment.outputs.items():
+        try:
+            lists[output_unit(name)], said = recorded_output(
+                recording, name, output, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
+            )
+            notes += said
+        except RecordingError as error:
+            at = ("configurations", name, "recorded")
             wrong += [Refused(path, line, at) for line in error.within(path)]
     recording = replace(recording, lists=lists, notes=tuple(notes))
     return recording, wrong + [Refused(path, reason, key) for key, reason in against_log(experiment, recording, wrong)]

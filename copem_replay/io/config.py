@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
@@ -21,6 +21,16 @@ class Recorded(Frozen):
     delay_s: Latency = 0.0
     covariance_m2: Covariance | None = None
     existence: Share = 0.9
+
+
+class RecordedOutput(Recorded):
+    """The fused lists of a stack as they were recorded, in the place of units and a fusion.
+
+    `delay_s`: how long before the stamp of a list its states were so, where its messages don't say; with
+    `tells_of: available` the stack predicts them to the instant its list is available.
+    """
+
+    tells_of: Literal["stamp", "available"] = "stamp"
 
 
 class Read(Frozen):

@@ -141,5 +141,7 @@ def _recorded(found: DecodedLists, details: Mapping[int, Mapping[str, Any]], top
         columns.object_ix[order] if found.named else np.full(len(order), -1),
         said,
         capture_said,
+        columns.stamped[by_time],
+        found.log_time_ns[by_time],
         int((~placed).sum()),
     )

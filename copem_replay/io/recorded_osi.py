@@ -43,7 +43,9 @@ class _Rows:
     existence: list[float] = field(default_factory=list)  # NaN: not said
     likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as it is said
     spread_said: list[bool] = field(default_factory=list)
-    capture_said: list[bool] = field(default_factory=list)  # of every list
+    capture_said: list[bool] = field(default_factory=list)  # of every list, as the next two
+    stamped: list[bool] = field(default_factory=list)
+    logged: list[int] = field(default_factory=list)
 
 
 def read_lists(path: Place, topic: str, scene: Scene) -> Tracks:
@@ -59,7 +61,8 @@ class RecordedLists:
     """Lists as a unit made them. Every row of `tracks` is a track of its own, without truth id: (P,) each.
 
     `existence` is NaN where it is not said; `class_probability (P, C)` sums to 1. `spread_said`: whether the list gives
-    the covariance of the position, else it is 0. `capture_said (F,)`: whether the list says when it was captured.
+    the covariance of the position, else it is 0. `capture_said (F,)`: whether the list says when it was captured,
+    `stamped (F,)` whether it has a time stamp, `logged_ns (F,)` when it was recorded.
     """
 
     tracks: Tracks
@@ -68,6 +71,8 @@ class RecordedLists:
     track_id: Int
     spread_said: Bool
     capture_said: Bool
+    stamped: Bool
+    logged_ns: Int
     dropped: int  # entries that had no place
 
 
@@ -108,6 +113,8 @@ def read_recorded(path: Place, topic: str, scene: Scene, window: Window | None =
         np.array(rows.track, dtype=np.int64)[order],
         np.array(rows.spread_said, dtype=bool)[order],
         np.array(rows.capture_said, dtype=bool)[by_time],
+        np.array(rows.stamped, dtype=bool)[by_time],
+        np.array(rows.logged, dtype=np.int64)[by_time],
         int((~placed).sum()),
     )
 
@@ -168,6 +175,8 @@ def _add(rows: _Rows, message: Any, log_time_ns: int) -> None:
     frame = len(rows.stamps)
     rows.stamps.append((captured_ns, arrives_ns))
     rows.capture_said.append(message.HasField("last_measurement_time"))
+    rows.stamped.append(message.HasField("timestamp"))
+    rows.logged.append(min(log_time_ns, LAST_NS))
     for item in [*message.moving_object, *message.stationary_object]:
         base, spread = item.base, item.base_rmse
         place, size, speed = base.position, base.dimension, getattr(base, "velocity", None)

@@ -39,13 +39,18 @@ def fixed_in(experiment: Mapping[str, Any]) -> Fixed:
     """
     units = _mapping(experiment.get("units"))
     recorded = {name for name, unit in units.items() if _mapping(unit).get("recorded")}
-    heard = {
-        str(name): _mapping(said).get("units") for name, said in _mapping(experiment.get("configurations")).items()
+    lists = {
+        str(name)
+        for name, said in _mapping(experiment.get("configurations")).items()
+        if _mapping(said).get("recorded") or _not_drawn(_mapping(said).get("units"), recorded)
     }
-    lists = {name for name, of in heard.items() if of == TRUTH or (isinstance(of, list) and set(of) <= recorded)}
     driver = _mapping(_mapping(experiment.get("braking")).get("driver"))
     reaction = driver.get("reaction")  # left out, it is no delay at all
     return Fixed(frozenset(lists), bool(driver) and (not reaction or _mapping(reaction).get("kind") == "constant"))
+
+
+def _not_drawn(units: Any, recorded: set[str]) -> bool:
+    return units == TRUTH or (isinstance(units, list) and set(units) <= recorded)
 
 
 def _mapping(said: Any) -> Mapping[str, Any]:

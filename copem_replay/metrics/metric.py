@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from copem_replay.metrics.accuracy.statistics import Total
+    from copem_replay.metrics.output_times import OutputTimes
 
 Value = float | int | str | None
 
@@ -30,7 +31,7 @@ class Given:
     """What the statistics of one configuration are made from, over all logs, runs and measured objects.
 
     `rows`: its rows of `detections.parquet`, log by log. `lists_fixed`, `reaction_fixed`: known alike, braking alike in
-    every run. `accuracy`, `exact`: None where the experiment asks for neither.
+    every run. `accuracy`, `exact`: None where the experiment asks for neither. `output`: of a stack's recorded output.
     """
 
     rows: pd.DataFrame
@@ -41,6 +42,7 @@ class Given:
     reaction_fixed: bool = False
     accuracy: Total | None = None
     exact: pd.DataFrame | None = None  # its rows of exact.parquet
+    output: OutputTimes | None = None
 
 
 @dataclass(frozen=True)

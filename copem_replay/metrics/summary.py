@@ -14,6 +14,7 @@ from copem_replay.metrics.accuracy.statistics import Total
 from copem_replay.metrics.fixed import Fixed
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.metric import Given, RowMetric, own_metrics, values
+from copem_replay.metrics.output_times import OutputTimes
 from copem_replay.metrics.summary_metrics import METRICS
 
 MUCH_BEYOND = 0.01
@@ -38,11 +39,13 @@ def summary(
     accuracy: Mapping[str, Total] | None = None,
     fixed: Fixed | None = None,
     own: Sequence[RowMetric] = (),
+    outputs: Mapping[str, OutputTimes] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and what has to be said about them.
 
     `exact`: the rows of `exact.parquet`. `accuracy`: by configuration the sums its figures are made of.
     `fixed`: what is the same in every run; None: nothing. `own`: the experiment's own metrics, whose columns come last.
+    `outputs`: how old the recorded outputs are, by configuration.
     """
     notes: list[str] = []
     fixed = fixed or Fixed()
@@ -68,6 +71,7 @@ def summary(
             reaction_fixed=fixed.passes(name),
             accuracy=accuracy[name] if accuracy else None,
             exact=exactly.get(name, exact.iloc[:0]) if exact is not None else None,
+            output=(outputs or {}).get(name),
         )
         rows.append({"configuration": name, **values(columns, given)})
     return pd.DataFrame(rows), notes

@@ -59,7 +59,9 @@ def _check_truth_ids(experiment: Experiment) -> None:
     """Raises ExperimentError for a configuration of which it is not known how probable its detections are."""
     for name, configuration in experiment.configurations.items():
         recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
-        if not by_truth(configuration) or experiment.measure.match.always:
+        if configuration.recorded is not None:
+            why = "it is recorded, and nothing says how probable its lists were"
+        elif not by_truth(configuration) or experiment.measure.match.always:
             why = "what is matched with the truth depends on sampled errors"
         elif recorded:
             why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"

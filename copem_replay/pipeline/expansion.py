@@ -1,7 +1,11 @@
-"""Fleets: units that some objects carry and others don't, each by an addressed draw of its own in every run.
+"""An experiment over one log: a unit for every object that may carry one, and one for the output of each stack.
+
+Fleets: units that some objects carry and others don't, each by an addressed draw of its own in every run.
 
 `on: {classes, penetration_rate}` stands for one unit per object of those classes (but the ego). In a run an object
 carries its unit when its number is below the share, so that who carries one at 30 % does at 50 %, too.
+
+A stack's recorded output is a recorded unit that its configuration alone hears, handed on as it is.
 """
 
 from __future__ import annotations
@@ -13,9 +17,10 @@ import numpy as np
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
-from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.experiment.schema import Configuration, Experiment, Unit, output_unit
+from copem_replay.fusion.as_recorded import AsPredicted, AsRecorded
 from copem_replay.fusion.base import ListFusion
-from copem_replay.io.config import Recorded
+from copem_replay.io.config import Recorded, RecordedOutput
 from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle
 from copem_replay.perception.pem.model import Pem
@@ -145,10 +150,26 @@ class ExpandedExperiment:
 
 
 def expand(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
-    """An experiment's units over one log, one for every object that may carry one.
+    """An experiment's units over one log, one for every object that may carry one, last those of recorded outputs.
 
     Raises ExperimentError where another unit has such a name.
     """
+    fleet = _with_carriers(experiment, scene)
+    if not experiment.outputs:
+        return fleet
+    units = dict(fleet.units)
+    for name, output in experiment.outputs.items():
+        one = output_unit(name)
+        if one in units:
+            raise ExperimentError(f"units: {one} is what the recorded output of {name} is called; choose another name")
+        units[one] = Unit(recorded=output)
+    added = tuple(units)[len(fleet.named) :]
+    none, sure = ("",) * len(added), np.ones(len(added))
+    return _expanded(experiment, units, (*fleet.named, *added), (*fleet.carrier, *none), np.append(fleet.share, sure))
+
+
+def _with_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
+    """The same without those of recorded outputs."""
     units: dict[str, Unit] = {}
     named: list[str] = []
     carriers: list[str] = []
@@ -176,16 +197,26 @@ def _expanded(
     experiment: Experiment, units: dict[str, Unit], named: tuple[str, ...], carrier: tuple[str, ...], share: Float
 ) -> ExpandedExperiment:
     """An experiment with these units in the place of its own."""
-    if all(name in units for name in experiment.units):
+    if units.keys() == experiment.units.keys():
         return ExpandedExperiment(experiment, experiment, named, carrier, share)
     members = {name: [unit for unit, of in zip(units, named, strict=True) if of == name] for name in experiment.units}
-    changed = {"units": units, "configurations": _members_for(experiment.configurations, members)}
+    configurations = _members_for(experiment.configurations, members)
+    for name, output in experiment.outputs.items():
+        if output_unit(name) in units:
+            configurations[name] = _heard_alone(configurations[name], name, output)
+    changed = {"units": units, "configurations": configurations}
     return ExpandedExperiment(experiment, experiment.model_copy(update=changed), named, carrier, share)
+
+
+def _heard_alone(configuration: Configuration, name: str, output: RecordedOutput) -> Configuration:
+    """A configuration that hands on what its unit lists."""
+    fusion = AsPredicted() if output.tells_of == "available" else AsRecorded()
+    return configuration.model_copy(update={"units": (output_unit(name),), "fusion": fusion, "recorded": None})
 
 
 def of_run(experiment: Experiment, scene: Scene, run: int) -> Experiment:
     """The experiment as it is in one run: with the units that are carried in it."""
-    expanded = expand(experiment, scene)
+    expanded = _with_carriers(experiment, scene)  # outputs are added when the run is made ready
     there = expanded.equipped(scene.log, np.array([run]))
     if there is None and expanded.units.keys() == experiment.units.keys():
         return experiment

@@ -21,6 +21,7 @@ from copem_replay.perception.observation import worlds
 from copem_replay.perception.pem.ghosts import Beside
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.sensor_poses import UnitPoses
+from copem_replay.pipeline.output_times import notes_on_outputs
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import without_points
 
@@ -43,6 +44,7 @@ def notes_of(
     notes += settings_notes(experiment)
     notes += without_points(experiment)
     notes += _remembered_in_vain(experiment)
+    notes += notes_on_outputs(experiment)
     if experiment.measure.accuracy and not same_instants(ready):
         outages = any(replay.expanded.outages for replay in ready)
         why = "outages" if outages else "units that only some runs have"

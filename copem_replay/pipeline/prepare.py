@@ -178,8 +178,9 @@ def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experime
     expanded = expand(experiment, scene)
     truth = at_instants(recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s)
     placed = place(scene, truth, expanded)
+    lists = {name: found for name, found in recording.lists.items() if name in expanded.units}
     recorded = recorded_units(
-        recording.lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
+        lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
     on = episodes(scene, truth, placed.static, onsets_of or experiment)
     meeting = encounters(scene, truth, on, experiment)

@@ -146,7 +146,8 @@ def listen(seen: Tracks, truth: Tracks, experiment: ExpandedExperiment, name: st
 
 def by_truth(configuration: Configuration) -> bool:
     """Whether a configuration's fused tracks have truth ids: the truth itself, and ideal fusion."""
-    return configuration.units == TRUTH or isinstance(configuration.fusion, Ideal)
+    made = configuration.recorded is None  # not a stack's own output
+    return made and (configuration.units == TRUTH or isinstance(configuration.fusion, Ideal))
 
 
 class Receivers:

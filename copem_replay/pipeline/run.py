@@ -24,6 +24,7 @@ from copem_replay.pipeline.cost import Cost, watched
 from copem_replay.pipeline.list_rates import list_rates
 from copem_replay.pipeline.memory import memory_notes
 from copem_replay.pipeline.notes import notes_of, same_instants
+from copem_replay.pipeline.output_times import output_times
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.sweep import Point, points
 
@@ -83,6 +84,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
         accuracy=totals(parts),
         fixed=fixed_in(experiment.as_written()),
         own=experiment.measure.metrics,
+        outputs=output_times(recordings, experiment),
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = notes_of(recordings, ready, experiment, replayed=True)

@@ -112,7 +112,8 @@ def _curves(
     for name, configuration in experiment.configurations.items():
         # A latency that is not above 0 is one only where it is given by unit, or the configuration is named.
         wanted = name in chosen if chosen is not None else kind != "latency_s" or bool(configuration.latency_s)
-        if not wanted or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
+        recorded = configuration.recorded is not None
+        if not wanted or recorded or configuration.units == TRUTH or not _concerns(experiment, configuration, kind):
             continue
         curve = tuple(_configuration_at(experiment, configuration, kind, value) for value in values)
         if curve not in curves.values():

@@ -315,4 +315,6 @@ def _provenance(path: Path) -> Provenance:
 def _knows_ids(configuration: dict[str, Any]) -> bool:
     """Whether a configuration needs no match with the truth to know an object."""
     fusion = configuration.get("fusion")
+    if configuration.get("recorded"):
+        return False
     return fusion is None or bool(fusion.get("kind", "ideal") == "ideal")

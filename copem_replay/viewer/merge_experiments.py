@@ -58,6 +58,8 @@ def _with(experiment: Experiment, configuration: Configuration, called: Mapping[
     changed: dict[str, object] = {}
     if configuration.units != "truth":
         changed["units"] = tuple(called[name] for name in experiment.units_of(configuration))
+    if configuration.inputs is not None:
+        changed["inputs"] = tuple(called[name] for name in configuration.inputs)
     if isinstance(configuration.latency_s, dict):
         changed["latency_s"] = {called.get(unit, unit): late for unit, late in configuration.latency_s.items()}
     return configuration.model_copy(update=changed)

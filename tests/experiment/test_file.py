@@ -501,7 +501,7 @@ CASES = [
      ".penetration_rate[1]: expected at most 1, found 50; a fraction: 50 % is 0.5"),
     (SWEEP, "{latency: [1]}", ".latency: unknown key; did you mean latency_s?"),
     (PEM, "", ": expected keys and values, found nothing"),
-    (PEM, "{}", ".units: missing"),
+    (PEM, "{}", ": units: missing (or `recorded: {topic: …}`, a stack's own output)"),
     (PEM, "{units: ego}", ".units: expected 'truth' or 'all', or a list, found 'ego'"),
     (PEM, "{units: []}", ".units: expected 'truth' or 'all', or at least 1 in the list, found []"),
     (PEM, "{units: [ego, {a: 1}]}", ".units[1]: expected text, found {'a': 1}"),

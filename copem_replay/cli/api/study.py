@@ -12,7 +12,7 @@ from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.experiment.cross_references import NO_EGO, references
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.file import Source, entries_of, load, log_paths, plain, with_logs
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.schema import Experiment, output_unit
 from copem_replay.experiment.validate import across_logs, against_log, bound, log_names, problems, read_logs
 from copem_replay.io.recording import Recording
 
@@ -149,6 +149,9 @@ def _misread(experiment: Experiment, recording: Recording) -> Iterator[str]:
         yield f"{recording.path}: read.topic: expected {topic} as in the experiment, found {recording.topic}; {way_out}"
     for name in experiment.recorded.keys() - recording.lists.keys():
         yield f"{recording.path}: expected the recorded lists of the unit {name}, found none; {way_out}"
+    for name in experiment.outputs:
+        if output_unit(name) not in recording.lists:
+            yield f"{recording.path}: expected the recorded output {name}, found none; {way_out}"
 
 
 def prepared(study: Study) -> tuple[list[Replay], list[str]]:

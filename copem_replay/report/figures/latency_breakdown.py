@@ -149,7 +149,8 @@ def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[s
         return {TRANSPORT: delay_s, FUSION: np.zeros_like(delay_s)}
     latency_s = {configuration.latency_of(unit) for unit in units} or {configuration.latency_of("truth")}
     fixed_s = latency_s.pop() if len(latency_s) == 1 else None
-    if fixed_s is None or any(unit in experiment.recorded for unit in units):
+    recorded = configuration.recorded is not None
+    if recorded or fixed_s is None or any(unit in experiment.recorded for unit in units):
         return {SINCE_CAPTURED: delay_s}
     transport_s = np.minimum(delay_s, fixed_s)
     return {TRANSPORT: transport_s, FUSION: delay_s - transport_s}

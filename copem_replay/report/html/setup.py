@@ -87,9 +87,9 @@ def configurations(study: Study) -> Html:
         truth = configuration.units == "truth"
         units = experiment.units_of(configuration)
         cells = (
-            "ground truth" if truth else f"{len(units)}: {some(units)}" if len(units) > 1 else "".join(units),
-            "–" if truth else _fusion(configuration),
-            _latency(configuration, units),
+            _heard(configuration, units),
+            "–" if truth else "its own" if configuration.recorded else _fusion(configuration),
+            "as recorded" if configuration.recorded else _latency(configuration, units),
         )
         rows.append(
             tag(
@@ -103,6 +103,15 @@ def configurations(study: Study) -> Html:
         )
     head = ["configuration", "units", "fusion", "latency"]
     return table(head, rows, caption="The configurations, and how each is drawn", id_="configurations")
+
+
+def _heard(configuration: Configuration, units: Sequence[str]) -> str:
+    if configuration.units == "truth":
+        return "ground truth"
+    if configuration.recorded is not None:
+        of = f", of {some(configuration.inputs)}" if configuration.inputs else ""
+        return f"recorded on {configuration.recorded.topic}{of}"
+    return f"{len(units)}: {some(units)}" if len(units) > 1 else "".join(units)
 
 
 def _fusion(configuration: Configuration) -> str:

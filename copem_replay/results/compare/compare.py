@@ -17,6 +17,7 @@ from copem_replay.results.compare.bootstrap import Draws, Whose
 from copem_replay.results.compare.comparable import check_comparable
 from copem_replay.results.compare.configuration_data import ConfigurationData, side_of
 from copem_replay.results.compare.equal_ghosts import notes_on_equal_ghosts, why_not
+from copem_replay.results.compare.ideals import notes_on_outputs
 from copem_replay.results.compare.inputs import read_folders
 from copem_replay.results.compare.labels import Named, chosen, named
 from copem_replay.results.compare.limits import limits
@@ -143,6 +144,7 @@ def compare(
             *notes_on_folders(used),
             *notes_on_pairs(against.label, second.there, {side.label: side.there for side in sides}),
             *note_on_measuring(against, others),
+            *notes_on_outputs(against, others),
             *notes_on_instants(second, sides, grid.logs),
             *notes_on_equal_ghosts(reasons),
             *notes_on_rows(table, setting.false_positives_per_min),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.text import unknown
+from copem_replay.results.compare.ideals import ideals
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -51,7 +52,8 @@ def _configurations(results: Results) -> list[str]:
 def chosen(known: Sequence[Named], configurations: Sequence[str] | None, baseline: str | None) -> tuple[Named, ...]:
     """The baseline, then the configurations to compare with it, each once. Raises InputError.
 
-    A name that several folders have stands for all of them; as a baseline it has to be one.
+    By default the baseline is `ideal`, else the only ideal fusion of the inputs of a recorded output. A name that
+    several folders have stands for all of them; as a baseline it has to be one.
     """
     labels = [one.label for one in known]
     against = _baseline(known, labels, baseline)
@@ -76,6 +78,8 @@ def _meant(known: Sequence[Named], name: str) -> list[Named]:
 
 def _baseline(known: Sequence[Named], labels: Sequence[str], name: str | None) -> Named:
     meant = _meant(known, DEFAULT_BASELINE if name is None else name)
+    if not meant and name is None:
+        meant = [one for one in known if one.configuration in ideals(one.results).values()]
     if len(meant) == 1:
         return meant[0]
     if meant:
