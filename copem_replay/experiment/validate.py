@@ -234,6 +234,9 @@ def against_log(
     studied = not none or experiment.ego != NO_EGO  # an ego that is sought and not there is said once
     if not studied and experiment.measure.distance_to == "ego":
         yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"
+    within = experiment.measure.objects.within
+    if not studied and within is not None and within.of_ego:
+        yield ("measure", "objects", "within"), "no ego in this study, whose way it could be; give `polygon_m`"
     for name, unit in experiment.units.items():
         if unit.on == "ego":
             if not studied:

@@ -6,22 +6,75 @@ import operator
 from collections.abc import Mapping
 from typing import Annotated, Literal, Protocol, Self
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from copem_replay.core.components import Flag, Frozen, Id, Positive, Slot
+from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Slot
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
 from copem_replay.metrics.metric import RowMetric
 from copem_replay.metrics.onset import ONSETS, InRange, Onset, Requires
-from copem_replay.perception.config import PerceptionSetup
+from copem_replay.perception.config import InPlane, PerceptionSetup, simple_polygon
 from copem_replay.perception.pem.condition import ClassNames
 
 
+def _is_none(value: object) -> bool:
+    return value is None
+
+
+Polygon = Annotated[tuple[InPlane, ...], Field(min_length=3)]
+
+
+def _only(self: BaseModel, *names: str) -> None:
+    given = [name for name in names if getattr(self, name) is not None]
+    if len(given) != 1:
+        raise ValueError(f"expected one of {', '.join(names)}, found {' and '.join(given) or 'none'}")
+
+
+class Within(Frozen):
+    """Which objects matter, by the truth: in a polygon or near the ego's way at their onset, or soon on that way.
+
+    `corridor_m`: at most so far from the way of the ego's centre through the log. `conflict_s`: at any instant until
+    the end of its episode the object, keeping its velocity, would within so long be where the ego, keeping its speed,
+    will sweep its way, and the margin of `measure.conflict` around it.
+    """
+
+    polygon_m: Polygon | None = None
+    corridor_m: NotNegative | None = None
+    conflict_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _only(self, "polygon_m", "corridor_m", "conflict_s")
+        if self.polygon_m is not None:
+            simple_polygon(self.polygon_m)
+        return self
+
+    @property
+    def of_ego(self) -> bool:
+        """Whether it takes an ego."""
+        return self.polygon_m is None
+
+
+class AnnotatedArea(Frozen):
+    """Where the truth holds all there is: a polygon, or so far around the place that distances are measured from."""
+
+    polygon_m: Polygon | None = None
+    range_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _only(self, "polygon_m", "range_m")
+        if self.polygon_m is not None:
+            simple_polygon(self.polygon_m)
+        return self
+
+
 class Objects(Frozen):
-    """Which objects are measured. Neither key: all moving objects but the ego."""
+    """Which objects are measured. No key: all moving objects but the ego. `within`: of these only what matters."""
 
     classes: ClassNames | None = None
     ids: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
+    within: Within | None = Field(default=None, exclude_if=_is_none)
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -93,7 +146,8 @@ class Gospa(Frozen):
 class Measure(Frozen):
     """What is measured, and from when. `accuracy`: how far off the fused lists are, beside when they hold an object.
 
-    `metrics`: own columns of the summary.
+    `annotated`: where entries at no true object are ghosts, by default everywhere. `metrics`: own columns of the
+    summary.
 
     >>> measure = cr.Measure(objects={"classes": ["vru"]}, onset={"kind": "in_range", "range_m": 30.0})
     >>> measure.onset.range_m, measure.confirm.hits
@@ -111,6 +165,7 @@ class Measure(Frozen):
     exact: Flag = False
     accuracy: Flag = True
     gospa: Gospa = Gospa()
+    annotated: AnnotatedArea | None = Field(default=None, exclude_if=_is_none)
     metrics: Annotated[tuple[Annotated[RowMetric, Slot("metric", {})], ...], Field(exclude_if=operator.not_)] = ()
 
     @model_validator(mode="after")

@@ -59,6 +59,7 @@ def summary(
     parts = _by_configuration(table)
     exactly = _by_configuration(exact) if exact is not None else {}
     notes += _beyond_the_gate(accuracy or {})
+    notes += _not_annotated(accuracy or {})
     columns = (*METRICS, *own_metrics(own))
     rows = []
     for name in configurations:
@@ -90,6 +91,15 @@ def _beyond_the_gate(accuracy: Mapping[str, Total]) -> list[str]:
         "are without them, so true covariances have a NEES of nees_expected, not 2 (a larger `measure: {match: "
         "{gate_m: …}}` keeps them)"
     ]
+
+
+def _not_annotated(accuracy: Mapping[str, Total]) -> list[str]:
+    """How many entries are no ghosts because nobody says what is there."""
+    counts = {name: int(of.runs["unannotated"]) for name, of in accuracy.items()}
+    if not any(counts.values()):
+        return []
+    said = ", ".join(f"{name} {count}" for name, count in counts.items())
+    return [f"entries at no object where the truth is not annotated, no ghosts, in all lists of all runs: {said}"]
 
 
 def _by_configuration(table: pd.DataFrame) -> dict[str, pd.DataFrame]:

@@ -80,6 +80,16 @@ def _crooked(reason: str) -> str:
     return words.get(what, "corners without an area between them")
 
 
+def simple_polygon(points_m: tuple[Point, ...]) -> tuple[Point, ...]:
+    """The corners of an area. Raises ValueError where its edges cross, or there is nothing between them."""
+    import shapely
+
+    polygon = shapely.Polygon(points_m)
+    if not polygon.is_valid or polygon.area <= 0:
+        raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
+    return points_m
+
+
 class Obstacle(Frozen):
     """A static obstacle beside those in the log."""
 
@@ -89,11 +99,7 @@ class Obstacle(Frozen):
 
     @model_validator(mode="after")
     def _simple(self) -> Self:
-        import shapely
-
-        polygon = shapely.Polygon(self.polygon_m)
-        if not polygon.is_valid or polygon.area <= 0:
-            raise ValueError(f"polygon_m: expected {_AROUND}, found {_crooked(shapely.is_valid_reason(polygon))}")
+        simple_polygon(self.polygon_m)
         return self
 
 

@@ -16,6 +16,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import Ideal
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import measured_objects
+from copem_replay.metrics.within import in_words
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.observation import worlds
 from copem_replay.perception.pem.ghosts import Beside
@@ -197,6 +198,10 @@ def _on(which: list[str], members: list[str]) -> str:
 def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
     """Why there are no rows, or no verdicts."""
     scene, measure, episodes = replay.scene, experiment.measure, replay.episodes
+    asked, outside = measure.objects.within, len(replay.outside_ix)
+    if asked is not None and outside:
+        of = counted(outside + len(episodes.object_ix), "object")
+        yield f"objects.within: {outside} of {of} with an onset left out, {in_words(asked)}"
     if not len(measured_objects(scene, measure)):
         others = np.arange(len(scene.object_class)) != scene.ego_ix
         there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["nobody"]
@@ -205,6 +210,8 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
         yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}"
     elif (instant_s := measure.onset.instant_s) is not None and instant_s > scene.end_s:
         yield f"no rows: the onset at {instant_s:g} s lies after the log's end, {scene.end_s:g} s"
+    elif not len(episodes.object_ix) and outside:
+        yield "no rows: no object with an onset matters by `objects.within`"
     elif not len(episodes.object_ix):
         yield f"no rows: no measured object has an onset ({measure.onset.kind})"
     if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:

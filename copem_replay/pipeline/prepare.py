@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ from copem_replay.metrics.braking.encounter import Encounter, encounters
 from copem_replay.metrics.braking.verdict import passing
 from copem_replay.metrics.episodes import Episodes, episodes
 from copem_replay.metrics.line_of_sight import first_sights
+from copem_replay.metrics.within import only_within
 from copem_replay.perception.observation import KeptShares, Observations, joined_chunks, observations
 from copem_replay.perception.sensor_poses import SensorPoses, place
 from copem_replay.pipeline.chunking import Reach, time_chunks
@@ -42,6 +43,7 @@ class Replay:
     episodes: Episodes
     encounters: tuple[Encounter, ...]  # those in conflict
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
+    outside_ix: Int = field(default_factory=lambda: np.empty(0, dtype=np.int64))  # (K,) what `within` leaves out
 
     @cached_property
     def ego(self) -> EgoPath:
@@ -182,7 +184,9 @@ def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experime
     recorded = recorded_units(
         lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
     )
-    on = episodes(scene, truth, placed.static, onsets_of or experiment)
+    on, outside_ix = only_within(
+        scene, truth, episodes(scene, truth, placed.static, onsets_of or experiment), onsets_of or experiment
+    )
     meeting = encounters(scene, truth, on, experiment)
     cut = time_chunks(scene, truth, expanded)
-    return Replay(scene, expanded, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries)
+    return Replay(scene, expanded, truth, placed, cut, recorded, on, meeting, recording.lane_boundaries, outside_ix)

@@ -17,7 +17,7 @@ from copem_replay.core.interpolation import AROUND_S, at_instants
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
 from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_runs
-from copem_replay.metrics.config import Measure, MetricsSetup
+from copem_replay.metrics.config import AnnotatedArea, Measure, MetricsSetup
 from copem_replay.metrics.detection.by_match import FirstMatches, Steps, captures_of
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.episodes import Episodes, measured_objects
@@ -175,6 +175,7 @@ def settings_of(measure: Measure, end_s: float) -> Settings:
     """Parameters of the accuracy for a log that ends at `end_s`."""
     cutoff_m = measure.gospa.cutoff_m if measure.gospa.cutoff_m is not None else measure.match.gate_m
     step_s = max(1, int(np.ceil(end_s / TIME_BANDS)))
+    area = measure.annotated or AnnotatedArea.model_construct()
     return Settings(
         cutoff_m,
         measure.match.gate_m,
@@ -182,4 +183,6 @@ def settings_of(measure: Measure, end_s: float) -> Settings:
         DISTANCE_EDGES_M,
         tuple(float(edge) for edge in range(0, int(end_s) + 1 + step_s, step_s)),
         EXISTENCE_THRESHOLDS,
+        area.polygon_m or (),
+        np.inf if area.range_m is None else area.range_m,
     )

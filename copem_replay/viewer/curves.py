@@ -9,8 +9,10 @@ import numpy as np
 from copem_replay.core.colours import TRUTH, Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import AROUND_S, at_instants, states_at
-from copem_replay.core.tracks import Float, Int, Tracks
+from copem_replay.core.tracks import Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.accuracy.statistics import Settings
+from copem_replay.metrics.area import corners, in_areas
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.metrics.gospa import gospas_m
 from copem_replay.pipeline.prepare import Replay
@@ -109,8 +111,11 @@ def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) 
     """
     scene, fused, measure = replay.scene, fused_tracks.fused, experiment.measure
     settings = settings_of(measure, scene.end_s)
-    measured = np.isin(np.arange(len(scene.object_ids) + 1), measured_objects(scene, measure))  # the last: nobody
+    numbers = np.arange(len(scene.object_ids) + 1)  # the last: nobody
+    measured = np.isin(numbers, measured_objects(scene, measure)) & ~np.isin(numbers, replay.outside_ix)
     ghosts = replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)] & (fused.row_object_ix < 0)
+    if measure.annotated is not None:
+        ghosts &= _annotated(replay, fused, settings)
     near_s, gap_s = fused.arrives_s[0], experiment.max_gap_s + AROUND_S
     near = replay.truth if not len(near_s) else replay.truth.captured_between(near_s[0] - gap_s, near_s[-1] + gap_s)
     truth = near.take_tracks(measured[near.object_ix])
@@ -128,6 +133,15 @@ def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) 
             there, bounds, at, starts[first : first + len(stamps) + 1], settings.cutoff_m, settings.power
         )
     return elapsed, value_m
+
+
+def _annotated(replay: Replay, fused: Tracks, settings: Settings) -> Bool:
+    """(P,) which entries of one run are where the truth is annotated."""
+    near = replay.truth_cache.reference(fused.arrives_s[0])
+    f = fused.frame_ix
+    return in_areas(
+        fused.x_m[0], fused.y_m[0], near.x_m[f], near.y_m[f], corners(settings.annotated_m), settings.annotated_range_m
+    )
 
 
 def gospas(out: Out, replay: Replay, experiment: Experiment, name: str, fused_tracks: FusedTracks, colour: Rgb) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -554,6 +554,10 @@ class Scenery:
         self.tells_of_now = bool(rng.uniform() < 0.3)
         self.found = self.matched(self.lists)
         self.rng = rng
+        if rng.uniform() < 0.5:  # else annotated everywhere
+            corners = tuple((4 * math.cos(a), 5 * math.sin(a)) for a in sorted(rng.uniform(0, 2 * math.pi, 4)))
+            self.settings = replace(self.settings, annotated_m=corners if rng.uniform() < 0.7 else (),
+                                    annotated_range_m=float(rng.choice([2.0, 5.0, np.inf])))  # fmt: skip
 
     def matched(self, lists: ObjectLists) -> tuple[Matches, Matches]:
         if self.tells_of_now:
@@ -599,6 +603,54 @@ class Scenery:
                 truth_of({o: way[a:b] for o, way in self.places.items()}, self.times[a:b].tolist(), self.velocity),
             )  # fmt: skip
         return adding.result()
+
+
+SQUARE = ((0.0, -5.0), (12.0, -5.0), (12.0, 5.0), (0.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    ("area", "ghosts", "unannotated"),
+    [
+        ({}, 4, 0),
+        ({"annotated_m": SQUARE}, 2, 2),  # of x = 10, 12 (on the edge), 13 and 30
+        ({"annotated_range_m": 13.0}, 3, 1),
+        ({"annotated_m": SQUARE, "annotated_range_m": 11.0}, 1, 3),
+    ],
+)
+def test_where_the_truth_is_not_annotated_entries_are_no_ghosts(
+    area: dict[str, Any], ghosts: int, unannotated: int
+) -> None:
+    """A car at 5 m, listed where it is; entries at no object at 10, 12, 13 and 30 m; that of a truck does not count."""
+    said = one_list(*(entry(x, 0, existence=0.8) for x in (5, 10, 12, 13, 30)), entry(40, 0, of="truck"))
+    found = assessed(
+        [said], places={CAR: standing(5, 0, 1)}, episodes={CAR: (0, 0)}, existence_thresholds=(0.5,), **area
+    )
+    run = found.by_run[0]
+    assert (run["ghosts"], run["unannotated"], found.ghosts_at[0, 0]) == (ghosts, unannotated, ghosts)
+    # GOSPA of power 2 and cut-off 3: 4.5 for each false entry; OSPA: 9 of each, by the larger number.
+    assert found.by_object[0, 0]["gospa_false"] == pytest.approx(4.5 * ghosts)
+    assert run["ospa_m"] == pytest.approx(math.sqrt(9 * ghosts / (1 + ghosts)))
+    assert found.by_existence[0]["entries"].sum() == 1 + ghosts
+    assert found.by_existence[0]["with_object"].sum() == 1
+
+
+def test_an_entry_at_an_object_counts_wherever_it_is() -> None:
+    """Beyond the area a car is annotated all the same: its entry is its match, and GOSPA has no miss."""
+    found = assessed(
+        [entry(20.5, 0)], places={CAR: standing(20, 0, 1)}, episodes={CAR: (0, 0)}, annotated_m=SQUARE
+    )  # fmt: skip
+    assert (found.by_object[0, 0]["pairs"], found.by_run[0]["unannotated"]) == (1, 0)
+    assert found.by_object[0, 0]["gospa_localisation"] == pytest.approx(0.25)
+
+
+def test_a_stale_entry_where_now_nothing_is_annotated() -> None:
+    """Of 1 s ago, when the car was there; now it has left it, and its entry, outside, is no ghost, stale or not."""
+    said = entry(15, 0, captured_s=-1.0)
+    captures = [-1.0], {CAR: standing(15, 0, 1)}
+    given: dict[str, Any] = {"places": {CAR: standing(30, 0, 1)}, "episodes": {CAR: (-2, 0)}, "captures": captures}
+    everywhere, inside = (assessed([said], **given, **area).by_run[0] for area in ({}, {"annotated_m": SQUARE}))
+    assert (everywhere["ghosts"], everywhere["stale_ghosts"], everywhere["unannotated"]) == (1, 1, 0)
+    assert (inside["ghosts"], inside["stale_ghosts"], inside["unannotated"]) == (0, 0, 1)
 
 
 _OF_FEWER_STEPS = ("nees_expected", "nees_square_expected", "beyond_gate")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammainc
 
@@ -89,6 +90,13 @@ def band_of(edges: Sequence[float], value: float) -> int | None:
         if edges[d] <= value < edges[d + 1]:
             return d
     return None
+
+
+def is_annotated(settings: Settings, place: Array, away_m: float) -> bool:
+    """Whether the truth is annotated at a place that is so far from the reference."""
+    corners = settings.annotated_m
+    inside = not corners or shapely.Polygon(corners).buffer(1e-6).covers(shapely.Point(place))
+    return inside and away_m <= settings.annotated_range_m + 1e-6
 
 
 def best_pairs(truth: Array, estimates: Array, cutoff_m: float, power: float) -> dict[int, tuple[int, float]]:
@@ -241,12 +249,14 @@ def plainly(
                 place = np.array([entry["x_m"], entry["y_m"]])
                 by_run[s]["duplicates"] += role == DUPLICATE and o in episodes.object_ix
                 is_measured = bool(measured[likely(entry)])
-                if is_measured:
+                unknown = not is_annotated(settings, place, away(k, place))
+                by_run[s]["unannotated"] += is_measured and unknown and role == GHOST
+                if is_measured and not (unknown and about.role[i] == GHOST):
                     claim = by_existence[s, min(int(entry["existence"] * 10), 9)]
                     claim["entries"] += 1
                     claim["existence"] += entry["existence"]
                     claim["with_object"] += about.role[i] != GHOST
-                if role == GHOST and is_measured:
+                if role == GHOST and is_measured and not unknown:
                     by_run[s]["ghosts"] += 1
                     if about.role[i] != GHOST:
                         by_run[s]["stale_ghosts"] += 1

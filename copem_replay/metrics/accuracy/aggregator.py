@@ -10,6 +10,7 @@ from copem_replay.core.object_list import ObjectLists
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Scene, Tracks
 from copem_replay.metrics.accuracy.kernel import Asked, Found, SoFar, Stays, Sums, World, add_up, close
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, EXISTENCE_BINS, OBJECT, RUN, Accuracy, Settings
+from copem_replay.metrics.area import corners
 from copem_replay.metrics.matching import Matches
 from copem_replay.metrics.reference import Reference
 
@@ -50,7 +51,7 @@ class Aggregator:
         thresholds = _column(settings.existence_thresholds)
         self._asked = Asked(
             settings.cutoff_m, settings.power, settings.gate_m, measured_class, distance_edges_m, time_edges_s,
-            thresholds,
+            thresholds, corners(settings.annotated_m), settings.annotated_range_m,
         )  # fmt: skip
         S, M, L = runs, len(episodes.object_ix), int(count.sum())
         self._out = Sums(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
 from copem_replay.metrics.accuracy.nees import expected, nees
+from copem_replay.metrics.area import in_area
 from copem_replay.metrics.gospa import gospa_pairs
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH
 
@@ -60,6 +61,8 @@ class Asked(NamedTuple):
     distance_edges_m: Float
     time_edges_s: Float
     existence_thresholds: Float
+    annotated_m: Float  # (V, 2) corners, none: anywhere
+    annotated_range_m: float
 
 
 class Sums(NamedTuple):
@@ -239,7 +242,17 @@ def _entries(
             if target >= 0:
                 out.by_object[s, m].duplicates += 1
         measured = asked.measured_class[about.class_ix[i]]
-        if target >= 0 or (now.role[i] == GHOST and measured):
+        nowhere = now.role[i] == GHOST
+        if (nowhere or about.role[i] == GHOST) and measured:
+            annotated = in_area(
+                entries[i].x_m, entries[i].y_m, from_m[0], from_m[1], asked.annotated_m, asked.annotated_range_m
+            )
+            if not annotated and nowhere:
+                out.by_run[s].unannotated += 1
+                nowhere = False
+            if not annotated and about.role[i] == GHOST:
+                measured = False
+        if target >= 0 or (nowhere and measured):
             estimates.x_m[count], estimates.y_m[count] = entries[i].x_m, entries[i].y_m
             count += 1
         if measured:
@@ -249,7 +262,7 @@ def _entries(
             claim.entries += 1
             claim.existence += existence
             claim.with_object += about.role[i] != GHOST
-            if now.role[i] == GHOST:
+            if nowhere:
                 stale = about.role[i] != GHOST
                 _ghost(
                     s, entries[i].x_m, entries[i].y_m, existence, stale, from_m, time_band, asked, targets, wanted,

@@ -38,6 +38,8 @@ Over all lists:
   distance, not those of the match. dᵖ, and cᵖ/2 of a miss, are the object's part, cᵖ/2 of a false entry is the part of
   the nearest one looked at. Mean of GOSPAᵖ over the lists in which something is looked at, to the power 1/p. Never
   matched: cᵖ/2 in each list.
+- where the truth is not annotated an entry that is at no object now is no ghost, and in no GOSPA, OSPA or ghost count;
+  one at no object at the instant it tells of has no say in the existence.
 - OSPA (m): of the same two sets; mean over the same lists.
 - existence: calibrated when of the entries with existence p the share p is of an object, at the instant they tell of.
   In ten bins of equal width, over the entries of measured classes, duplicates being of an object too. Expected
@@ -105,6 +107,7 @@ RUN = np.dtype(
         ("stale_ghosts", "i8"),
         ("duplicates", "i8"),  # of measured objects, looked at or not
         ("lists_looked", "i8"),  # in which something is looked at
+        ("unannotated", "i8"),  # entries of measured classes that would be ghosts where the truth is annotated
     ]
 )
 """Sums of one run."""
@@ -126,6 +129,8 @@ class Settings:
     distance_edges_m: tuple[float, ...] = ()
     time_edges_s: tuple[float, ...] = ()
     existence_thresholds: tuple[float, ...] = ()
+    annotated_m: tuple[tuple[float, float], ...] = ()  # corners of where the truth is annotated; none: anywhere
+    annotated_range_m: float = np.inf  # and how far around the reference
 
 
 @dataclass(frozen=True)

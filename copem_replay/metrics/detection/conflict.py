@@ -7,17 +7,19 @@ it. Ways are compared, not times: nobody is expected to be exactly in time.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
 
 from copem_replay.core.box_distance import pose_on
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 from copem_replay.metrics.braking.ego_path import EgoPath
 from copem_replay.metrics.config import Confirm, Conflict
-from copem_replay.metrics.episodes import Episodes
+
+if TYPE_CHECKING:
+    from copem_replay.metrics.episodes import Episodes
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 _PIECE_M = 2.0
@@ -45,10 +47,7 @@ class ConflictDetector:
         fused = fused_tracks.fused
         self._runs = max(self._runs, first_run + len(fused.valid))
         issue_s = fused.arrives_s[0]
-        pieces, bounds = corridors(self._ego, issue_s, self._wanted)
-        implied = np.zeros(fused.valid.shape, dtype=np.bool_)
-        boxes = _Boxes(fused.x_m, fused.y_m, fused.yaw_rad, fused.vx_mps, fused.vy_mps, fused.length_m, fused.width_m)
-        _implied(fused.valid, boxes, fused.frame_ix, pieces, bounds, self._wanted.horizon_s, implied)
+        implied = implied_by(fused, self._ego, self._wanted)
         newest_s = fused_tracks.captured_s
         track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
         for m, object_ix in enumerate(self._found.object_ix.tolist()):
@@ -79,6 +78,15 @@ class ConflictDetector:
             if len(enough):
                 first_s[s, m] = issue_s[held[enough[0] + hits - 1]]
         return first_s
+
+
+def implied_by(tracks: Tracks, ego: EgoPath, wanted: Conflict) -> Bool:
+    """(S, P) which states of tracks imply a collision, at the instants their lists are available."""
+    pieces, bounds = corridors(ego, tracks.arrives_s[0], wanted)
+    implied = np.zeros(tracks.valid.shape, dtype=np.bool_)
+    columns = (tracks.x_m, tracks.y_m, tracks.yaw_rad, tracks.vx_mps, tracks.vy_mps, tracks.length_m, tracks.width_m)
+    _implied(tracks.valid, _Boxes(*columns), tracks.frame_ix, pieces, bounds, wanted.horizon_s, implied)
+    return implied
 
 
 def corridors(ego: EgoPath, now_s: Float, wanted: Conflict) -> tuple[Float, Int]:

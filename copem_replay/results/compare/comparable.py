@@ -11,7 +11,7 @@ from copem_replay.core.errors import InputError
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
 
-_MEASURE = ("objects", "onset", "count_earlier", "confirm", "match", "distance_to", "horizon_s", "gospa")
+_MEASURE = ("objects", "onset", "count_earlier", "confirm", "match", "distance_to", "horizon_s", "gospa", "annotated")
 """Keys of `measure` that the compared metrics depend on."""
 
 

@@ -1,0 +1,50 @@
+"""Whether a place is in an area: by Shapely, and at the edges by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from copem_replay.metrics.area import corners, in_area, in_areas, in_polygon
+
+L_SHAPE = ((0.0, 0.0), (10.0, 0.0), (10.0, 4.0), (4.0, 4.0), (4.0, 10.0), (0.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((1, 9), True), ((9, 1), True), ((5, 5), False), ((4, 4), True), ((4, 7), True), ((4.00001, 7), False),
+        ((0, 0), True), ((-1e-5, 5), False), ((10, 4), True), ((-3, 4), False), ((12, 4), False), ((2, 10), True),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("turned", [1, -1])
+def test_an_l_by_hand(place: tuple[float, float], expected: bool, turned: int) -> None:
+    assert in_polygon(*place, corners(L_SHAPE[::turned])) is expected
+
+
+@given(
+    st.lists(st.floats(0, 2 * math.pi), min_size=3, max_size=7, unique=True),
+    st.lists(st.floats(0.5, 3), min_size=7, max_size=7),
+    st.tuples(st.floats(-4, 4), st.floats(-4, 4)),
+)
+def test_as_shapely_has_it(angles: list[float], radii: list[float], place: tuple[float, float]) -> None:
+    star = tuple((r * math.cos(a), r * math.sin(a)) for a, r in zip(sorted(angles), radii, strict=False))
+    polygon = shapely.Polygon(star)
+    edge_m = shapely.distance(polygon.exterior, shapely.Point(place))
+    if not polygon.is_valid or abs(edge_m - 1e-6) < 1e-9:
+        return
+    assert in_polygon(*place, corners(star)) is bool(polygon.covers(shapely.Point(place)) or edge_m <= 1e-6)
+
+
+def test_a_range_and_a_polygon() -> None:
+    square = corners(((0, 0), (4, 0), (4, 4), (0, 4)))
+    assert in_area(3.0, 0.0, 0.0, 0.0, square, 3.0)
+    assert not in_area(3.1, 0.0, 0.0, 0.0, square, 3.0)
+    assert in_area(100.0, 0.0, 0.0, 0.0, corners(None), np.inf)
+    x_m = np.array([1.0, 5.0, 3.0])
+    assert in_areas(x_m, x_m, np.zeros(3), np.zeros(3), square, 2.0).tolist() == [True, False, False]

@@ -1,0 +1,222 @@
+"""Only what matters: polygons, the ego's way and conflicts by hand, conflicts against a plain oracle, too."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import shapely
+
+from copem_replay.core.errors import ExperimentError
+from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import against_log
+from copem_replay.io.recording import Recording
+from copem_replay.metrics.episodes import episodes
+from copem_replay.metrics.within import only_within
+from copem_replay.perception.visibility import NO_STATICS
+from copem_replay.pipeline.notes import oddities
+from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.run import run
+from tests.helpers import scenes
+from tests.helpers.scenes import Thing, driving, experiment, recording, standing
+from tests.metrics.test_conflict import corridor_of, swept
+
+APPEARS = {"onset": {"kind": "appears"}}
+
+
+def passing() -> Recording:
+    """The ego drives 40 m east in 4 s; a car is parked 3 m beside its way, one 10 m behind its start, one 12 m aside.
+
+    A pedestrian, 40 m ahead and 20 m right of the way, walks towards it at 4 m/s: he is 4 m from it when the log ends.
+    """
+    return recording(
+        [
+            Thing("ego", "car", driving(0, 0, 10)), Thing("parked", "car", standing(20, 3)),
+            Thing("behind", "car", standing(-10, 0)), Thing("aside", "car", standing(20, 12)),
+            Thing("walker", "pedestrian", driving(40, -20, 0, 4)),
+        ],
+        until_s=4.0,
+    )  # fmt: skip
+
+
+def kept(log: Recording, within: Any, **measure: Any) -> set[str]:
+    wanted = experiment(measure=APPEARS | {"objects": {"within": within}} | measure)
+    every = episodes(log.scene, log.truth, NO_STATICS, wanted)
+    found, outside_ix = only_within(log.scene, log.truth, every, wanted)
+    assert sorted([*found.object_ix, *outside_ix]) == sorted(every.object_ix)
+    return {log.scene.object_ids[k] for k in found.object_ix}
+
+
+class TestByHand:
+    @pytest.mark.parametrize(
+        ("corridor_m", "expected"),
+        [
+            (2.99, set()), (3.0, {"parked"}), (9.99, {"parked"}), (10.0, {"parked", "behind"}),
+            (12.0, {"parked", "behind", "aside"}), (20.0, {"parked", "behind", "aside", "walker"}),
+        ],
+    )  # fmt: skip
+    def test_beside_the_way(self, corridor_m: float, expected: set[str]) -> None:
+        """To the way as driven: it begins at x = 0 and ends at 40; the pedestrian appears 20 m beside it."""
+        assert kept(passing(), {"corridor_m": corridor_m}) == expected
+
+    def test_an_ego_that_stands(self) -> None:
+        log = recording([Thing("ego", "car", standing(0, 0)), Thing("a", "car", standing(3, 4))], until_s=1.0)
+        assert kept(log, {"corridor_m": 5.0}) == {"a"}
+        assert kept(log, {"corridor_m": 4.9}) == set()
+
+    @pytest.mark.parametrize(
+        ("polygon_m", "expected"),
+        [
+            ([[-1, -1], [30, -1], [30, 3], [-1, 3]], {"parked"}),  # on its edge
+            ([[-20, -30], [50, -30], [50, 30], [-20, 30]], {"parked", "behind", "aside", "walker"}),
+            ([[39, -4.5], [41, -4.5], [41, -3.5], [39, -3.5]], set()),  # where the pedestrian only is at last
+        ],
+    )
+    def test_in_a_polygon_at_the_onset(self, polygon_m: Any, expected: set[str]) -> None:
+        assert kept(passing(), {"polygon_m": polygon_m}) == expected
+
+    def test_it_is_the_onset_that_decides(self) -> None:
+        """The oncoming car appears 100 m away and comes into range, of 80 m, at 2 s."""
+        far, near = ([[x - 5, -5], [x + 5, -5], [x + 5, 5], [x - 5, 5]] for x in (100, 80))
+        in_range = {"onset": {"kind": "in_range", "range_m": 80}}
+        assert kept(scenes.oncoming_car(), {"polygon_m": far}, **in_range) == set()
+        assert kept(scenes.oncoming_car(), {"polygon_m": near}, **in_range) == {"other"}
+
+    @pytest.mark.parametrize(
+        ("conflict_s", "margin_m", "expected"),
+        [(1.0, 0.5, {"walker"}), (0.5, 0.5, set()), (0.5, 0.9, {"walker"}), (0.01, 2.5, {"parked"})],
+    )
+    def test_on_the_way_soon(self, conflict_s: float, margin_m: float, expected: set[str]) -> None:
+        """His box (.5 m) is .25 m ahead of him, the ego's corridor 1 m wide on each side and the margin.
+
+        At the last frame he is 4 m from the line: .5 s bring him to 2 m, 1.75 m from it, which a margin of .9 m reaches
+        and one of .5 m does not. The parked car's side is 2 m beside the line.
+        """
+        got = kept(passing(), {"conflict_s": conflict_s}, conflict={"margin_m": margin_m})
+        assert got - {"behind"} == expected
+
+    def test_until_the_end_of_the_episode_only(self) -> None:
+        """A pedestrian who is gone before he is near the way is in no conflict, nor one before his onset."""
+        walker = Thing("walker", "pedestrian", driving(40, -20, 0, 4), there=lambda t: t < 3.01)
+        log = recording([Thing("ego", "car", driving(0, 0, 10)), walker], until_s=4.0)
+        assert kept(log, {"conflict_s": 1.0}) == set()
+        away = Thing("away", "pedestrian", driving(15, 0, 0, 5), size_m=(0.5, 0.5, 1.8))
+        log = recording([Thing("ego", "car", driving(0, 0, 10)), away], until_s=4.0)
+        assert kept(log, {"conflict_s": 1.0}) == {"away"}
+        assert kept(log, {"conflict_s": 1.0}, onset={"kind": "at", "time_s": 2.0}) == set()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_conflicts_as_the_words_have_them(seed: int) -> None:
+    """Frame by frame the hull of what an object sweeps against the ego's boxes along its way."""
+    rng = np.random.default_rng(seed)
+    things = [Thing("ego", "car", driving(0, 0, float(rng.uniform(2, 12))))]
+    for k in range(8):
+        place, speed = rng.uniform(-15, 40, 2), rng.normal(0, 5, 2)
+        things.append(Thing(f"o{k}", "car", driving(*place.tolist(), *speed.tolist()), yaw_rad=rng.uniform(-3, 3)))
+    log, horizon_s = recording(things, until_s=2.0, rate_hz=5.0), float(rng.uniform(0.3, 3))
+    found = kept(log, {"conflict_s": horizon_s})
+
+    def expected(margin_m: float) -> set[str]:
+        return {thing.name for k, thing in enumerate(things) if k and _meets(log, k, horizon_s, margin_m)}
+
+    assert expected(0.47) <= found <= expected(0.53)
+
+
+def _meets(log: Recording, track: int, horizon_s: float, margin_m: float) -> bool:
+    truth = log.truth
+    for p in range(truth.start[track], truth.start[track + 1]):
+        corridor = shapely.union_all(corridor_of(log, truth.row_captured_s[p], horizon_s).boxes(margin_m))
+        names = ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m")
+        if swept(*(float(getattr(truth, name)[0, p]) for name in names), horizon_s).intersects(corridor):
+            return True
+    return False
+
+
+class TestInARun:
+    def test_what_is_left_changes_in_nothing(self) -> None:
+        """Rows of the others are those without it, bit for bit; what is left out is counted, and no ghost."""
+        sees = [{"detection": {"kind": "constant", "probability": 0.5}, "error": {
+            "kind": "gaussian", "covariance_m2": [[0.2, 0], [0, 0.2]]}}]  # fmt: skip
+        more: dict[str, Any] = {
+            "pems": {"sure": sees}, "runs": 5,
+            "configurations": {"PEM": {"units": ["ego"]}, "union": {"units": ["ego"], "fusion": {"kind": "union"}}},
+        }  # fmt: skip
+        every = experiment(measure=APPEARS, **more)
+        some = experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 5}}}, **more)
+        whole, part = (run(plan, [passing()]) for plan in (every, some))
+        mine = whole.table[whole.table["object_id"] == "parked"].reset_index(drop=True)
+        pd.testing.assert_frame_equal(mine, part.table, check_exact=True)
+        ghosts = [of.summary["false_positives_per_min"].tolist() for of in (whole, part)]
+        assert ghosts[0] == ghosts[1]
+        said = (
+            "objects.within: 3 of 4 objects with an onset left out, more than 5 m beside the ego's way at their onset"
+        )
+        assert f"scene: {said}" in part.notes
+        assert not any("within" in note for note in whole.notes)
+
+    def test_nobody_is_left(self) -> None:
+        replay = prepare(passing(), wanted := experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 1}}}))
+        said = list(oddities(replay, wanted))
+        assert "no rows: no object with an onset matters by `objects.within`" in said
+        assert (
+            "objects.within: 4 of 4 objects with an onset left out, more than 1 m beside the ego's way at their onset"
+            in said
+        )
+
+    @pytest.mark.parametrize("within", [{"corridor_m": 5.0}, {"conflict_s": 2.0}])
+    def test_without_an_ego(self, within: Any) -> None:
+        log = recording([Thing("a", "car", standing(3, 4))], until_s=1.0, ego=None)
+        units = {"mast": {"at": [0, 0], "height_m": 5, "pem": "sure"}}
+        plan = {"ego": "none", "units": units, "configurations": {"PEM": {"units": ["mast"]}}}
+        wanted = experiment(**plan, measure=APPEARS | {"objects": {"within": within}, "distance_to": "mast"})
+        problems = dict(against_log(wanted, log))
+        assert problems[("measure", "objects", "within")].startswith("no ego in this study, whose way it could be")
+        with pytest.raises(ExperimentError, match=r"scene: measure\.objects\.within: no ego in this study"):
+            prepare(log, wanted)
+
+    def test_ghosts_where_nothing_is_annotated(self) -> None:
+        """Two parked cars that only a recorded list would name are absent here, so the PEM's errors make the ghosts."""
+        wide = [{"detection": {"kind": "constant", "probability": 1.0}, "error": {
+            "kind": "gaussian", "covariance_m2": [[25.0, 0], [0, 25.0]]}}]  # fmt: skip
+        union = {"union": {"units": ["ego"], "fusion": {"kind": "union"}}}
+        plans = [experiment(measure=APPEARS | area, pems={"sure": wide}, runs=20, configurations=union)
+                 for area in ({}, {"annotated": {"range_m": 1000.0}}, {"annotated": {"range_m": 12.0}})]  # fmt: skip
+        whole, same, near = (run(plan, [passing()]) for plan in plans)
+        pd.testing.assert_frame_equal(whole.summary, same.summary, check_exact=True)
+        fewer = [of.summary["false_positives_per_min"][0] for of in (whole, near)]
+        assert 0 < fewer[1] < fewer[0] / 2
+        assert near.summary["gospa_false_m"][0] < whole.summary["gospa_false_m"][0]
+        pd.testing.assert_frame_equal(
+            *(of.table[["object_id", "run", "detection_s", "matched_lists", "position_rmse_m"]] for of in (whole, near))
+        )
+        assert any("entries at no object where the truth is not annotated, no ghosts" in note for note in near.notes)
+
+
+@pytest.mark.parametrize(
+    ("measure", "said"),
+    [
+        ({"objects": {"within": {}}}, "expected one of polygon_m, corridor_m, conflict_s, found none"),
+        ({"objects": {"within": {"corridor_m": 1.0, "conflict_s": 2.0}}}, "found corridor_m and conflict_s"),
+        ({"objects": {"within": {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}}}, "edges that cross or overlap"),
+        ({"annotated": {}}, "expected one of polygon_m, range_m, found none"),
+        (
+            {"annotated": {"polygon_m": [[0, 0], [1, 1], [2, 2]]}},
+            "polygon_m: expected the corners in order around an area",
+        ),
+    ],
+)
+def test_refused(measure: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        experiment(measure=measure)
+
+
+def test_left_out_they_are_not_written() -> None:
+    """Results of before stay comparable: keys that say nothing are not there."""
+    written = experiment().as_written()["measure"]
+    assert "annotated" not in written
+    assert "within" not in written["objects"]
+    area = {"annotated": {"range_m": 50.0}, "objects": {"within": {"conflict_s": 3.0}}}
+    assert Experiment.model_validate(experiment(measure=area).as_written()).measure == experiment(measure=area).measure
