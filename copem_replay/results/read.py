@@ -42,11 +42,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LogFile:
-    """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content."""
+    """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content.
+
+    `truth`: the SHA-256 of its truth, None: an older version did not say it.
+    """
 
     name: str
     topic: str | None
     sha256: str
+    truth: str | None = None
 
 
 @dataclass(frozen=True)
@@ -290,7 +294,9 @@ def _provenance(path: Path) -> Provenance:
         data: Any = json.loads(path.read_text(encoding="utf-8"))
         if (found := dict(data).get("format", 1)) != FORMAT:
             raise InputError(f"{path.parent}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
-        logs = tuple(LogFile(str(log["log"]), log.get("topic"), str(log["sha256"])) for log in data["logs"])
+        logs = tuple(
+            LogFile(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
+        )
         measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
         used_s, run_shown = measure.pop("horizon_used_s", None), data.get("run_shown") or {}
         return Provenance(

@@ -25,6 +25,7 @@ from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import place_of
 from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
+from copem_replay.io.truth_digest import truth_digest
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
@@ -187,7 +188,8 @@ def provenance_of(
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
-            {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.place)} for r in recordings
+            {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.place), "truth": truth_digest(r.scene, r.truth)}
+            for r in recordings
         ],
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility.label,

@@ -67,6 +67,7 @@ def write_beside(
     read = read_folders(folders)
     check_comparable(read)
     wanted = chosen(named(read), configurations, baseline)
+    _check_one_recording(list(dict.fromkeys(one.results for one in wanted)))
     used = [complete(results) for results in dict.fromkeys(one.results for one in wanted)]
     log, number = _which(used[0], used, log, run)
     for one in wanted:
@@ -115,6 +116,19 @@ def _every(read: Sequence[Results], experiment: Experiment) -> dict[str, Configu
             label = label_of.get((results, name), f"{results.name}:{name}")
             found[label] = experiment.configurations.get(label, asked)
     return found
+
+
+def _check_one_recording(used: Sequence[Results]) -> None:
+    """Raise InputError where folders are of several recordings of a drive: one picture has what one of them holds."""
+    expected = {(log.name, log.sha256) for log in used[0].provenance.logs}
+    for other in used[1:]:
+        for log in other.provenance.logs:
+            if (log.name, log.sha256) not in expected:
+                where = used[0].folder
+                raise InputError(
+                    f"{other.folder}: log {log.name}: expected the recording of {where}, found another of the same "
+                    "drive: they cannot be shown together; compare them without --rrd"
+                )
 
 
 def _which(first: Results, every: Sequence[Results], log: str | None, run: int | None) -> tuple[str, int]:

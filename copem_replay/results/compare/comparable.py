@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from copem_replay.core.errors import InputError
+from copem_replay.results.compare.same_drive import by_truth, log_keys
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -28,7 +29,8 @@ def _problems(first: Results, other: Results) -> Iterator[str]:
     for key in ("seed", "window_s", "max_gap_s"):
         yield from _differs(first, other, key, getattr(before, key), getattr(after, key))
     # As written: whom `null` stands for is in the logs.
-    yield from _differs(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
+    if not by_truth(first, other):  # which has the ego in it
+        yield from _differs(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
     for key in _MEASURE:
         yield from _differs(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
     onset = before.measure.get("onset")
@@ -51,13 +53,16 @@ def _brief(value: Any) -> str:
 
 
 def _logs(first: Results, other: Results) -> Iterator[str]:
-    """Other recordings; or the same by another name or another truth, of which the draws and objects differ."""
-    expected, found = ({log.sha256: log.name for log in folder.provenance.logs} for folder in (first, other))
+    """Other drives; or, where only files tell them, the same by another name or another truth."""
+    known = by_truth(first, other)
+    expected, found = ({key: log.name for key, log in keys.items()} for keys in log_keys(first, other))
     missing, more = ([a[sha] for sha in a if sha not in b] for a, b in ((expected, found), (found, expected)))
     if missing or more:
         lacks = [f"{', '.join(missing)} missing"] if missing else []
-        other_ones = [f"{', '.join(more)} of other content (SHA-256)"] if more else []
+        other_ones = [f"{', '.join(more)} of {'another truth' if known else 'other content (SHA-256)'}"] if more else []
         yield f"{other.folder}: expected the logs of {first.folder}, found {' and '.join(lacks + other_ones)}"
+        return
+    if known:
         return
     names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
     if names != other_names or expected != found:

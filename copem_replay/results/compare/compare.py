@@ -31,6 +31,7 @@ from copem_replay.results.compare.notes import (
 )
 from copem_replay.results.compare.paired_statistics import mcnemar
 from copem_replay.results.compare.pairing import Grid, grid_of
+from copem_replay.results.compare.same_drive import check_names, notes_on_differences, renamed
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -107,8 +108,10 @@ def compare(
         )
     read = read_folders(folders)
     check_comparable(read)
+    read, renames = renamed(read)
     grid = grid_of(read)
     against, *others = chosen(named(read), configurations, baseline)
+    check_names(against, others, renames)
     used = list(dict.fromkeys(one.results for one in (against, *others)))
     second = side_of(against, grid)
     setting = _setting(read, second, false_positives_per_min)
@@ -142,6 +145,7 @@ def compare(
         false_positives_per_min=setting.false_positives_per_min,
         notes=(
             *notes_on_folders(used),
+            *notes_on_differences(used, renames),
             *notes_on_pairs(against.label, second.there, {side.label: side.there for side in sides}),
             *note_on_measuring(against, others),
             *notes_on_outputs(against, others),
