@@ -3,7 +3,7 @@
 | table | rows |
 |---|---|
 | `accuracy` | as `detections`: by list of the object's stay its position error, and its part of GOSPAᵖ; its ghosts |
-| `instants` | log × configuration: when each fused list was available |
+| `instants` | log × configuration, and run where runs differ in them: when each fused list was available |
 | `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |
 | `bands` | configuration × distance, time (by log) or existence: from, to, and the figures in between |
@@ -88,10 +88,10 @@ def _scattered(outcome: Outcome) -> bool:
 
 @dataclass(frozen=True)
 class AccuracyTables:
-    """The tables, in the order of `detections`. `accuracy` and `instants` are None where runs differ in their units."""
+    """The tables, in the order of `detections`. `instants` has a row per run where runs differ in them."""
 
-    accuracy: pa.Table | None
-    instants: pa.Table | None
+    accuracy: pa.Table
+    instants: pa.Table
     lists: pa.Table
     thresholds: pa.Table
     bands: pd.DataFrame
@@ -99,8 +99,8 @@ class AccuracyTables:
 
 def accuracy_tables(outcomes: Sequence[Outcome], order: Int, *, same_instants: bool) -> AccuracyTables:
     """All tables of runs of several logs, `order (n,)` being that of the rows of all outcomes in `detections`."""
-    per_list = _per_list(outcomes).take(pa.array(order)) if same_instants else None
-    instants = _instants(outcomes) if same_instants else None
+    per_list = _per_list(outcomes).take(pa.array(order))
+    instants = _instants(outcomes) if same_instants else _instants_by_run(outcomes)
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
     return AccuracyTables(per_list, instants, _lists(outcomes), _thresholds(outcomes, place), bands(outcomes))
@@ -154,6 +154,26 @@ def _instants(outcomes: Sequence[Outcome]) -> pa.Table:
             "log": pa.array([log for log, _ in rows], pa.string()),
             "configuration": pa.array([name for _, name in rows], pa.string()),
             "available_s": pa.array([list(times) for times in rows.values()], pa.list_(pa.float64())),
+        }
+    )
+
+
+def _instants_by_run(outcomes: Sequence[Outcome]) -> pa.Table:
+    """The same with a row for every run, which has its own units or outages, and so its own instants."""
+    rows = [
+        (outcome.log, name, run, scores.issue_s)
+        for outcome in outcomes
+        for name, scores, _ in _accuracies(outcome)
+        for run in outcome.runs.tolist()
+    ]
+    places = {key: k for k, key in enumerate(dict.fromkeys(row[:2] for row in rows))}
+    rows.sort(key=lambda row: (places[row[:2]], row[2]))
+    return pa.table(
+        {
+            "log": pa.array([row[0] for row in rows], pa.string()),
+            "configuration": pa.array([row[1] for row in rows], pa.string()),
+            "run": pa.array([row[2] for row in rows], pa.int64()),
+            "available_s": pa.array([row[3] for row in rows], pa.list_(pa.float64())),
         }
     )
 

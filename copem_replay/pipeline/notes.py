@@ -46,10 +46,6 @@ def notes_of(
     notes += without_points(experiment)
     notes += _remembered_in_vain(experiment)
     notes += notes_on_outputs(experiment)
-    if experiment.measure.accuracy and not same_instants(ready):
-        outages = any(replay.expanded.outages for replay in ready)
-        why = "outages" if outages else "units that only some runs have"
-        notes.append(f"no accuracy.parquet: {why} give each run its own instants")
     return notes
 
 

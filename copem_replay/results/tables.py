@@ -55,6 +55,8 @@ OPTIONAL = {
     "thresholds.parquet": _OBJECT | {"existence": "numbers", "detection_s": "numbers"},
 }
 """Files of a results folder that need not be there, and the columns of them that comparisons read."""
+MAY_HAVE = {"instants.parquet": {"run": "whole numbers"}}
+"""Columns that a file has where runs differ in their units."""
 
 
 def read_csv(path: Path) -> pd.DataFrame:
@@ -90,7 +92,10 @@ def is_rowless(path: Path) -> bool:
 
 
 def read_arrow(path: Path, columns: Mapping[str, str]) -> pa.Table:
-    """These columns of a table, text as `string`. Raises InputError where one is missing or of another kind."""
+    """These columns of a table, text as `string`, and those that it may have.
+
+    Raises InputError where one is missing or of another kind.
+    """
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -98,6 +103,7 @@ def read_arrow(path: Path, columns: Mapping[str, str]) -> pa.Table:
         there = parquet.read_schema(path).names
         if missing := [name for name in columns if name not in there]:
             raise InputError(f"{path}: expected the column {missing[0]}, found none; {AGAIN}")
+        columns = dict(columns) | {n: kind for n, kind in MAY_HAVE.get(path.name, {}).items() if n in there}
         table = parquet.read_table(path, columns=list(columns))
     except (OSError, ValueError) as error:  # what Arrow raises derives from these
         why = " ".join(str(error).split())

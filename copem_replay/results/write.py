@@ -92,7 +92,7 @@ def _files(
     files = [EXPERIMENT, MARK, "detections.parquet", "summary.csv"]
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
     if result.accuracy is not None:
-        files += [f"{name}.parquet" for name in _ACCURACY if getattr(result.accuracy, name) is not None] + ["bands.csv"]
+        files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
     for log in shown_logs(experiment, result):
         for shown in shown_runs(experiment, result, log):
             stem, shown_count = _target(shown, log, recordings), len(experiment.shown())
@@ -223,8 +223,7 @@ def write_parquet(table: Any, path: Path) -> None:
 
 def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
     for name in _ACCURACY:
-        if (table := getattr(tables, name)) is not None:
-            write_parquet(table, scratch / f"{name}.parquet")
+        write_parquet(getattr(tables, name), scratch / f"{name}.parquet")
     write_csv(tables.bands, scratch / "bands.csv")
 
 

@@ -85,7 +85,10 @@ class TestOutages:
         result = run(plan, [alone(10.0)])
         rates = result.summary["list_rate_hz"]
         assert (rates < 9.9).all()
-        assert any("outages give each run its own instants" in note for note in result.notes)
+        assert result.accuracy is not None
+        instants, lists = (table.to_pandas() for table in (result.accuracy.instants, result.accuracy.lists))
+        assert instants["run"].tolist() == lists["run"].tolist()  # each run has its own
+        assert instants["available_s"].map(len).tolist() == lists["lists"].tolist()
 
     def test_units_are_down_each_by_itself(self) -> None:
         off = {"down_share": 0.5, "lasts_s": 0.5}

@@ -215,13 +215,11 @@ class TestWhatIsThere:
         assert result.table["detected"].all()
 
     def test_fleets(self) -> None:
-        """Each run has other units, so other instants: no accuracy.parquet; all else, whatever the blocks."""
+        """Each run has other units, so other instants, which are told by run; whatever the blocks."""
         fleet = {"ego": UNITS["ego"], "obu": {"on": {"classes": ["car"], "penetration_rate": 0.5}, "pem": "p"}}
         late = configurations("union", "gnn", latency_s={"ego": 0.0, "default": 0.13})
         plan = experiment(units=fleet, pems=pems(0.8, 0.5), runs=8, measure=APPEARS, configurations=late)
         result = run(plan, [street("one", 10)])
-        assert (tables(result).accuracy, tables(result).instants) == (None, None)
-        assert any(note.startswith("no accuracy.parquet: ") for note in result.notes)
         assert len(set(rows(result, "union", "lists")["lists"])) > 1
         for name in ("GT", "ideal", "union", "gnn"):
             table, found = result.table[result.table["configuration"] == name], figures(result, name)
@@ -231,6 +229,19 @@ class TestWhatIsThere:
             lists = rows(result, name, "lists")
             assert lists["ghosts"].sum() / lists["minutes"].sum() == pytest.approx(found["false_positives_per_min"])
             assert lists["run"].tolist() == list(range(8))
+            instants = rows(result, name, "instants")
+            assert instants["run"].tolist() == list(range(8))
+            late = instants["available_s"].map(lambda of: sum(t > 1e-6 + result.replays[0].scene.end_s for t in of))
+            assert (instants["available_s"].map(len) - late).tolist() == lists["lists"].tolist()
+            errors = rows(result, name)
+            pd.testing.assert_frame_equal(
+                errors[["run", "object_id"]].reset_index(drop=True), table[["run", "object_id"]].reset_index(drop=True)
+            )
+            of_row = [np.array(row, dtype=float) for row in errors["error_m"]]
+            square_m2 = np.array([np.nansum(row**2) for row in of_row])
+            pairs = np.array([np.isfinite(row).sum() for row in of_row])
+            assert pairs.tolist() == (table["matched_lists"] - table["unplaced_lists"]).tolist()
+            np.testing.assert_allclose(square_m2, pairs * table["position_rmse_m"].fillna(0) ** 2, rtol=2e-3, atol=1e-4)
             first = rows(result, name, "thresholds").groupby(KEYS, sort=False)["detection_s"].first()
             if name in ("union", "gnn"):
                 pd.testing.assert_series_equal(first, table.set_index(KEYS)["detection_s"].dropna(), check_exact=True)
@@ -238,6 +249,8 @@ class TestWhatIsThere:
             patch.setattr(blocks_module, "BLOCK_BYTES", 1)
             other = run(plan, [street("one", 10)], jobs=2)
         pd.testing.assert_frame_equal(result.summary, other.summary, check_exact=True)
+        for name in ("accuracy", "instants", "lists", "thresholds"):
+            assert getattr(tables(result), name).equals(getattr(tables(other), name)), name
         pd.testing.assert_frame_equal(result.table, other.table, check_exact=True)
         for name in ("lists", "thresholds", "bands"):
             assert getattr(tables(result), name).equals(getattr(tables(other), name)), name

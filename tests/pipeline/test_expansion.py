@@ -736,10 +736,10 @@ def test_the_run_that_is_shown_has_its_own_units(
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "experiment.yaml", "provenance.json", "detections.parquet", "summary.csv", "exact.parquet", "replay.mcap",
-        "replay.rrd", "bands.csv", "lists.parquet", "thresholds.parquet",
+        "replay.rrd", "bands.csv", "lists.parquet", "thresholds.parquet", "accuracy.parquet", "instants.parquet",
     }  # fmt: skip
     # Lists of a run come when its own units send them: there are no instants that all runs have.
-    assert "note: no accuracy.parquet: " in capsys.readouterr().err
+    assert "run" in pd.read_parquet(folder / "instants.parquet")
     source = source_of(folder, (folder / "experiment.yaml").read_text())
     wanted, found = problems(source)
     assert wanted is not None, found

@@ -329,6 +329,6 @@ def test_without_accuracy_the_rest_is_compared(tmp_path):
     accuracy = ("position_rmse_m", "gospa_m", "false_positives_per_min", "ttd_rmst_s_equal_ghosts")
     assert by["first:late"] - by["second:late"] == set(accuracy)
     assert note_of("without accuracy", comparison.notes) == (
-        f"{second}: no accuracy.parquet, instants.parquet, lists.parquet, thresholds.parquet (without accuracy, with "
-        f"units that only some runs have, or of an older version): not compared: {', '.join(accuracy)}"
+        f"{second}: no accuracy.parquet, instants.parquet, lists.parquet, thresholds.parquet (without "
+        f"accuracy, or of an older version): not compared: {', '.join(accuracy)}"
     )

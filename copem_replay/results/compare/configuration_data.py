@@ -26,7 +26,8 @@ _AGAIN = "run the experiment again with --overwrite"
 class AccuracyData:
     """Lists of a configuration against the truth: of each cell `length` of them from `first` on, at `start` in values.
 
-    `first` counts in the instants of the cell's log; `available_s` has those of all logs, log by log.
+    `first` counts in the instants of the cell's log and run, `available_s[of_place[place]]`; they are those of the log
+    in all runs unless `by_run`, where runs differ in their units.
     """
 
     start: Int  # (N·S,)
@@ -35,7 +36,9 @@ class AccuracyData:
     ghosts: Int  # (N·S,) false entries nearest to this object
     error_m: Float  # (V,) NaN: not matched
     gospa: Float  # (V,) this object's part of GOSPA to its power; NaN: before the onset
-    available_s: tuple[Float, ...]  # L times (K,)
+    available_s: tuple[Float, ...]  # (K,) each
+    of_place: Int  # (L·S,)
+    by_run: bool
 
 
 @dataclass(frozen=True)
@@ -148,12 +151,19 @@ def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) 
         raise InputError(f"{place}: expected error_m and gospa_m2 of equal length, found others; {_AGAIN}")
     instants = tables["instants.parquet"]
     counts, flat_s = lists(instants["available_s"])
-    until, of_log = np.cumsum(counts), grid.log_numbers(instants)
-    times_s = {int(of_log[k]): flat_s[until[k] - counts[k] : until[k]] for k in range(len(counts))}
-    available_s = tuple(times_s.get(k, np.empty(0)) for k in range(len(grid.logs)))
+    by_run, until = "run" in instants.column_names, np.cumsum(counts)
+    times_s = [flat_s[until[k] - counts[k] : until[k]] for k in range(len(counts))]
+    available_s = (*times_s, np.empty(0))  # the last: none
+    of_place = np.full(len(grid.logs) * grid.runs, len(counts))
+    of_row = grid.places(instants) if by_run else grid.log_numbers(instants)
+    there = np.flatnonzero(of_row >= 0)
+    if by_run:
+        of_place[of_row[there]] = there
+    else:
+        of_place.reshape(len(grid.logs), grid.runs)[of_row[there]] = there[:, None]
     first, size = whole(rows["first_list"]), len(grid.object_of)
     kept = cell >= 0
-    last = np.array([len(times) for times in available_s], dtype=np.int64)[grid.log_of[cell[kept]]]
+    last = np.array([len(times) for times in available_s], dtype=np.int64)[of_place[grid.place_of[cell[kept]]]]
     if (first[kept] < 0).any() or ((first + length)[kept] > last)[length[kept] > 0].any():
         raise InputError(f"{place}: expected lists of instants.parquet, found more; {_AGAIN}")
     start = np.cumsum(length) - length
@@ -165,6 +175,8 @@ def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) 
         error_m=error_m,
         gospa=gospa,
         available_s=available_s,
+        of_place=of_place,
+        by_run=by_run,
     )
 
 

@@ -37,8 +37,8 @@ def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
         metrics = [metric for metric, files in _NEEDED.items() if files & set(missing)]
         if metrics:
             yield (
-                f"{folder.folder}: no {', '.join(missing)} (without accuracy, with units that only some runs have, or "
-                f"of an older version): not compared: {', '.join(metrics)}"
+                f"{folder.folder}: no {', '.join(missing)} (without accuracy, or of "
+                f"an older version): not compared: {', '.join(metrics)}"
             )
     with_braking = [folder for folder in folders if folder.provenance.braking is not None]
     if with_braking and len(with_braking) < len(folders):
@@ -63,8 +63,8 @@ def notes_on_instants(
     for side in others:
         if side.accuracy is None or baseline.accuracy is None:
             continue
-        shared = shared_instants(side.accuracy, baseline.accuracy)
-        mine, theirs = (sum(map(len, one.accuracy.available_s)) for one in (side, baseline) if one.accuracy)
+        shared, *of_each = shared_instants(side.accuracy, baseline.accuracy, len(logs))
+        mine, theirs = (int(of.sum()) for of in of_each)
         if shared.sum() < max(mine, theirs):
             none = ", ".join(name for name, number in zip(logs, shared, strict=True) if number == 0)
             alike.setdefault((int(shared.sum()), mine, theirs, none if len(logs) > 1 else ""), []).append(side.label)

@@ -66,6 +66,12 @@ class Grid:
         return of
 
     @cached_property
+    def place_of(self) -> Int:
+        """(N·S,) the place of each cell: its log and run."""
+        of: Int = self.log_of * self.runs + self.run_of
+        return of
+
+    @cached_property
     def run_of(self) -> Int:
         """(N·S,) the run of each cell."""
         return np.tile(np.arange(self.runs), len(self.objects))

@@ -34,7 +34,7 @@ class Together:
 def together(first: AccuracyData, second: AccuracyData, grid: Grid, cells: Int) -> Together:
     """Pair the lists of cells (C,)."""
     places = len(grid.logs) * grid.runs
-    other, offset = _same_instants(first, second)
+    other, offset = _same_instants(first, second, np.arange(places))
     most = max((len(times) for times in first.available_s), default=0)
     matched, measured = np.zeros((2, len(cells)), dtype=np.int64)
     squared, gospa = np.zeros((2, len(cells), 2))
@@ -42,7 +42,7 @@ def together(first: AccuracyData, second: AccuracyData, grid: Grid, cells: Int) 
     until = np.cumsum(first.length[cells])
     bounds = np.searchsorted(until, np.arange(_VALUES, int(until[-1]) if len(until) else 0, _VALUES))
     for part in np.split(np.arange(len(cells)), bounds):
-        row, at, number, same = _aligned(first, second, other, offset[grid.log_of[cells]], cells, part)
+        row, at, number, same = _aligned(first, second, other, offset[grid.place_of[cells]], cells, part)
         both = [side.error_m[k].astype(float) for side, k in ((first, at), (second, same))]
         k = ~np.isnan(both[0] + both[1])
         matched += np.bincount(row[k], minlength=len(cells))
@@ -52,21 +52,36 @@ def together(first: AccuracyData, second: AccuracyData, grid: Grid, cells: Int) 
         for side in (0, 1):
             squared[:, side] += np.bincount(row[k], both[side][k] ** 2, minlength=len(cells))
             gospa[:, side] += np.bincount(row[g], parts[side][g], minlength=len(cells))
-        place = grid.log_of[cells[row[g]]] * grid.runs + grid.run_of[cells[row[g]]]
+        place = grid.place_of[cells[row[g]]]
         seen[place * most + number[g]] = True
     return Together(matched, squared, measured, gospa, seen.reshape(places, most).sum(axis=1))
 
 
-def shared_instants(first: AccuracyData, second: AccuracyData) -> Int:
-    """(L,) how many instants of each log both have."""
-    other, offset = _same_instants(first, second)
-    return np.array([int((part >= 0).sum()) for part in np.split(other, offset[1:])], dtype=np.int64)
+def instants(side: AccuracyData, logs: int, *, by_run: bool) -> Int:
+    """(L,) how many instants each log has, of all its runs if `by_run`."""
+    counts = np.array([len(times) for times in side.available_s])[side.of_place].reshape(logs, -1)
+    found: Int = counts.sum(axis=1) if by_run else counts[:, 0]
+    return found
 
 
-def _same_instants(first: AccuracyData, second: AccuracyData) -> tuple[Int, Int]:
-    """For each instant of the first, log by log, its number in the second, −1: none; and where each log begins (L,)."""
+def shared_instants(first: AccuracyData, second: AccuracyData, logs: int) -> tuple[Int, Int, Int]:
+    """(L,) how many instants of each log both have, and how many each; of all runs where those of a side differ."""
+    by_run = first.by_run or second.by_run
+    places = np.arange(len(first.of_place)).reshape(logs, -1)
+    places = places if by_run else places[:, :1]
+    other, offset = _same_instants(first, second, places.ravel())
+    length = np.array([len(times) for times in first.available_s])[first.of_place[places.ravel()]]
+    has = np.append(0, np.cumsum(other >= 0))
+    both = (has[offset + length] - has[offset]).reshape(places.shape).sum(axis=1)
+    return both, instants(first, logs, by_run=by_run), instants(second, logs, by_run=by_run)
+
+
+def _same_instants(first: AccuracyData, second: AccuracyData, places: Int) -> tuple[Int, Int]:
+    """For instants of the first their numbers in the second, −1: none; and where those of each place (R,) begin."""
+    pairs, which = np.unique(np.stack([first.of_place[places], second.of_place[places]]), axis=1, return_inverse=True)
     found = []
-    for mine_s, other_s in zip(first.available_s, second.available_s, strict=True):
+    for mine, others in pairs.T.tolist():
+        mine_s, other_s = first.available_s[mine], second.available_s[others]
         # The nearest of the other's, to the left or to the right.
         right = np.searchsorted(other_s, mine_s)
         near = np.full(len(mine_s), -1, dtype=np.int64)
@@ -76,7 +91,8 @@ def _same_instants(first: AccuracyData, second: AccuracyData) -> tuple[Int, Int]
             near[there] = k[there]
         found.append(near)
     counts = np.array([len(near) for near in found], dtype=np.int64)
-    return np.concatenate([np.empty(0, dtype=np.int64), *found]), np.cumsum(counts) - counts
+    begins = (np.cumsum(counts) - counts)[which.ravel()]
+    return np.concatenate([np.empty(0, dtype=np.int64), *found]), begins
 
 
 def _aligned(
