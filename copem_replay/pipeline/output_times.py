@@ -28,7 +28,8 @@ def _of_log(recording: Recording, experiment: Experiment, name: str) -> OutputTi
     while_it_lasts = (available_s >= -_TOLERANCE_S) & (available_s <= recording.scene.end_s + _TOLERANCE_S)
     delay_s = np.where(found.capture_said, 0.0, experiment.outputs[name].delay_s)[while_it_lasts]
     says = (found.capture_said | found.stamped)[while_it_lasts]
-    latency_s = (available_s - captured_s)[while_it_lasts] - delay_s
+    # To a nanosecond, as stamps are: .7 − .57 − .13 is not 0.
+    latency_s = np.round((available_s - captured_s)[while_it_lasts] - delay_s, 9)
     age_s = available_s[while_it_lasts] - _newest_input_s(recording, experiment, name, available_s[while_it_lasts])
     there = np.isfinite(age_s)
     return OutputTimes(
