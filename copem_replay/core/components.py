@@ -85,8 +85,6 @@ NotNegative = Annotated[float, Field(strict=True, ge=0, le=_LARGEST)]
 Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
 """Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
-Latency = Annotated[float, Field(strict=True, ge=0, le=86_400)]
-"""Seconds, a day at most (chosen: more is a mistake, and a stamp in nanoseconds has an end)."""
 Count = Annotated[int, Field(strict=True, ge=1, le=10**9)]
 Flag = Annotated[bool, Field(strict=True)]
 """True or false; `yes` is text."""

@@ -35,7 +35,7 @@ def summary_text(summary: pd.DataFrame, width: int | None = None) -> str:
             "pass_share: of those in conflict, how many the declared driver, braking when it knew, stays clear of"
         )
     if "output_latency_s" in summary:
-        lines += ["", _part(summary[summary["output_delay_s"].notna()], "output")]
+        lines += ["", *_part(summary[summary["output_delay_s"].notna()], "output", width)]
         lines.append("output_latency_s: available − the stamp of the state; output_delay_s: that stamp − the state")
     own = [name for name in summary if name not in ("configuration", *METRIC)]
     if own:
