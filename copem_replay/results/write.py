@@ -188,7 +188,12 @@ def provenance_of(
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
-            {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.place), "truth": truth_digest(r.scene, r.truth)}
+            {
+                "log": r.scene.log,
+                "topic": r.topic,
+                "sha256": sha256_of(r.place),
+                "truth": truth_digest(r.scene, r.truth),
+            }
             for r in recordings
         ],
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],

@@ -99,10 +99,10 @@ def test_reports_and_figures_do_without(tmp_path: Path) -> None:
     tail = "\n".join(line for line in tail.splitlines() if not line.startswith(("  late", "  half: {u", "  never")))
     folder = replayed(tmp_path, head + tail[tail.index("configurations:") :] + "\n")
     found = Page(page(load_study(folder)))
-    assert any(line.startswith("How sure: there are no intervals, for every run is the same") for line in found.lines())
-    assert "detected_share, no 95 % of GT, hit: nothing drawn, every run is the same." in found.words
+    assert any(line.startswith("There are no intervals: every run is the same") for line in found.lines())
+    assert "Detected: no 95 % interval of GT, hit: nothing drawn, every run is the same." in found.words
     cell = found.tables["summary"]["GT"]["detected_share"]
-    assert (cell.text.strip(), cell.low, cell.high) == ("1", None, None)
+    assert (cell.text.strip(), cell.low, cell.high) == ("100", None, None)
     assert "(nothing drawn)" in found.tables["regret"]["hit"]["ttd_rmst_s"].text
     figure = curves_figure(load_results(folder))
     assert not figure.axes[0].collections

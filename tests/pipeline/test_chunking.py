@@ -410,8 +410,8 @@ def test_the_results_folder(
     for name in files - {"replay.rrd"}:
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "pieces" / name).read_bytes(), name
     whole, pieces = (shown_in(tmp_path / out / "replay.rrd") for out in ("whole", "pieces"))
-    assert {"/world/gnn/status", "/world/ideal/listings", "/lanes/2\\ pedestrian"} <= whole.keys()
+    assert {"/world/gnn/status", "/world/ideal/listings", "/lanes/2_pedestrian/3_gnn"} <= whole.keys()
     why = [name for name in whole if name.endswith(("status", "hiding", "listings")) or name.startswith("/lanes")]
-    assert len(why) == 4 + 3 + 2  # of all configurations, of those with units, of both objects
+    assert len(why) == 4 + 3 + 4 * 2  # of all configurations, of those with units, of each and both objects
     assert {name: whole[name] for name in why} == {name: pieces[name] for name in why}
     assert whole.keys() == pieces.keys()
