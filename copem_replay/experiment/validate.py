@@ -230,7 +230,7 @@ def against_log(
             f"({moving_ids(scene)}), or `ego: none` with `distance_to: <unit>`",
         )
     if experiment.braking is not None and not none and not scene.ego_sized:
-        yield ("braking",), "nobody says how large the ego is; give `ego: {topic: …, size_m: [length, width, height]}`"
+        yield ("braking",), "the size of the ego is not known; give `ego: {topic: …, size_m: [length, width, height]}`"
     studied = not none or experiment.ego != NO_EGO  # an ego that is sought and not there is said once
     if not studied and experiment.measure.distance_to == "ego":
         yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"

@@ -76,7 +76,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     yield from _unmeasured(replay, experiment)
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
-            yield f"unit {name}: the log has nobody to carry it ({', '.join(unit.on.classes)})"
+            yield f"unit {name}: the log has no object to carry it ({', '.join(unit.on.classes)})"
     yield from _clocks(experiment)
     yield from _beside_nobody(replay, experiment)
     end_s = replay.scene.end_s
@@ -215,5 +215,5 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
         yield (
             f"no verdict: the ego, not braking ({'as recorded' if recorded else 'at constant speed'}), stays more than "
             f"{experiment.braking.margin_m:g} m from all that is measured"
-            + ("; `ego: constant_speed` asks what if nobody had braked" if recorded else "")
+            + ("; `ego: constant_speed` asks what if the ego had not braked" if recorded else "")
         )

@@ -161,9 +161,7 @@ class Results:
         """The tables that comparisons read, by file name, those that are there."""
         place = self.folder / "detections.parquet"
         if is_rowless(place):
-            raise InputError(
-                f"{self.folder}: nobody was measured, so nothing can be compared: no measured object has an onset"
-            )
+            raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
         tables = {place.name: read_arrow(place, DETECTIONS | (VERDICTS if self.provenance.braking is not None else {}))}
         there = {name: columns for name, columns in OPTIONAL.items() if (self.folder / name).is_file()}
         tables |= {name: read_arrow(self.folder / name, columns) for name, columns in there.items()}

@@ -775,4 +775,4 @@ def test_a_sweep_that_changes_nothing_is_said() -> None:
     ) in found.notes
     units = {"ego": UNITS["ego"], "buses": {"on": {"classes": ["bus"], "penetration_rate": 0.5}, "pem": "p"}}
     found = run(plan({"penetration_rate": [0, 1]}, units=units, configurations={"all": {"units": "all"}}), [crossing()])
-    assert any(note.endswith("unit buses: the log has nobody to carry it (bus)") for note in found.notes)
+    assert any(note.endswith("unit buses: the log has no object to carry it (bus)") for note in found.notes)

@@ -149,8 +149,8 @@ def test_what_the_table_shows_is_said_below(tmp_path):
         "are all the same, too",
         "(all alike): the difference is the same in every cluster, or a median in nearly all, so that nothing tells "
         "how it varies",
-        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that, who was still there at the "
-        "end as censored",
+        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that, objects still there at the "
+        "end are censored",
     ]
 
 

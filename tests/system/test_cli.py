@@ -457,7 +457,7 @@ class TestRun:
         assert "all configurations: n 0, list_rate_hz 10" in ended.out.splitlines()
         refused = call("compare", "out/e", "--baseline", "PEM")
         assert (refused.code, refused.lines) == (
-            2, ["out/e: nobody was measured, so nothing can be compared: no measured object has an onset"],
+            2, ["out/e: nothing can be compared: no measured object has an onset"],
         )  # fmt: skip
 
     @pytest.mark.parametrize(

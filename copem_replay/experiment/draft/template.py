@@ -224,7 +224,7 @@ def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool)
         ("PEM", f"{{units: [{first[0]}]}}", "the vehicle on its own" if ego else "one mast on its own"),
         ("coPEM:0s", f"{both}, fusion: {{kind: ideal}}}}", "together"),
         ("coPEM:0.5s", f"{both}, fusion: {{kind: ideal}}, latency_s: 0.5}}", "the whole list late"),
-        ("gnn:0.5s", f"{both}, fusion: {{kind: gnn}}, latency_s: 0.5}}", "a fusion that does not know who is who"),
+        ("gnn:0.5s", f"{both}, fusion: {{kind: gnn}}, latency_s: 0.5}}", "a fusion without truth ids"),
     ]  # fmt: skip
     for name in recorded:
         rows.append((name, f"{{units: [{name}], fusion: {{kind: gnn}}}}", "as it was recorded"))
@@ -243,7 +243,7 @@ def _measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     else:
         yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
     if guess.onset == "appears":
-        yield "  onset: {kind: appears}   # the clock starts; nobody comes within 50 m of the ego (in_range)"
+        yield "  onset: {kind: appears}   # the clock starts; no object comes within 50 m of the ego (in_range)"
     else:
         yield "  onset: {kind: in_range, range_m: 50}   # the clock starts; or appears, starts_moving, line_of_sight"
     if not ego:
