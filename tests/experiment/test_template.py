@@ -366,7 +366,7 @@ def test_what_cannot_be_replayed_is_one_line(tmp_path: Path, call: Call) -> None
 
 def test_usage(call: Call, tmp_path: Path) -> None:
     drive(tmp_path / "drive.mcap")
-    for arguments, said in (([], "Missing argument 'LOG...'."), (["a", "b"], "expected one recording, found 2")):
+    for arguments, said in (([], "Missing argument 'LOG'."), (["a", "b"], "expected one recording, found 2")):
         ended = call("init", *arguments)
         assert (ended.code, ended.out) == (2, "")
         assert said in ended.err[0]

@@ -24,12 +24,14 @@ def check_comparable(folders: Sequence[Results]) -> None:
 
 
 def _problems(first: Results, other: Results) -> Iterator[str]:
-    yield from _logs(first, other)
     before, after = first.provenance, other.provenance
+    other_logs = list(_logs(first, other))
+    if before.window_s == after.window_s:  # else their truths differ for that reason alone, perhaps
+        yield from other_logs
     for key in ("seed", "window_s", "max_gap_s"):
         yield from _differs(first, other, key, getattr(before, key), getattr(after, key))
     # As written: whom `null` stands for is in the logs.
-    if not by_truth(first, other):  # which has the ego in it
+    if other_logs or not by_truth(first, other):  # whose truths are the same have the same ego
         yield from _differs(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
     for key in _MEASURE:
         yield from _differs(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
