@@ -25,11 +25,17 @@ def executed(path: Path) -> Any:
 
 def printed(notebook: Any) -> list[str]:
     """What its cells print and give, in order; pictures by their format only."""
-    texts = []
+    texts: list[str] = []
     for cell in notebook.cells:
+        stream = None
         for output in cell.get("outputs", []):
-            data = output.get("data", {})
-            texts.append(output["text"] if "text" in output else ", ".join(sorted(data)))
+            if "text" not in output:
+                texts.append(", ".join(sorted(output.get("data", {}))))
+            elif stream is not None and output.get("name") == stream:
+                texts[-1] += output["text"]  # one text may come in several pieces, by how busy the machine is
+            else:
+                texts.append(output["text"])
+            stream = output.get("name")
     return texts
 
 

@@ -25,3 +25,13 @@ def test_notebook_prints_what_it_shows(path: Path) -> None:
 
 def test_there_are_notebooks() -> None:
     assert [path.stem for path in NOTEBOOKS] == ["01_the_paper", "02_your_own_fusion", "03_reading_the_results"]
+
+
+def test_a_text_that_comes_in_pieces_is_one_text() -> None:
+    def said(text: str, name: str = "stdout") -> dict[str, str]:
+        return {"output_type": "stream", "name": name, "text": text}
+
+    picture = {"output_type": "display_data", "data": {"image/png": "", "text/plain": ""}}
+    cells = [[said("a"), said("\n"), said("b", "stderr"), said("c")], [said("d"), picture, said("e")]]
+    notebook = nbformat.from_dict({"cells": [{"outputs": outputs} for outputs in cells]})
+    assert printed(notebook) == ["a\n", "b", "c", "d", "image/png, text/plain", "e"]
