@@ -9,7 +9,7 @@ import numpy as np
 from copem_replay.core.tracks import Float
 from copem_replay.perception.pem.condition import Condition, Couple
 
-_ARC_STEP_RAD = np.deg2rad(5)  # chosen: a chord of 80 m is 8 cm off the arc
+_ARC_STEP_RAD = np.deg2rad(3)  # chosen: a chord at 80 m is 3 cm off the arc
 
 
 def outlines(pem: Sequence[Couple]) -> list[Float]:

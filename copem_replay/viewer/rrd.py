@@ -97,7 +97,7 @@ def write_rrd(
         del first  # one chunk's is held at a time
         for chunk in chunks:
             for file, shown in zip(files, faults, strict=True):
-                _believed(file, chunk)
+                _fused(file, chunk)
                 shown.add(chunk)
             told.add(chunk)
         whole, found = told.whole(), replay.rows_of(told.object_ix)
@@ -191,7 +191,7 @@ def _begin(
         curves.known(out, replay, "truth", replay.truth)
 
 
-def _believed(file: _File, run_tracks: Mapping[str, FusedTracks]) -> None:
+def _fused(file: _File, run_tracks: Mapping[str, FusedTracks]) -> None:
     """What each configuration knew in a time chunk, of all objects."""
     out, of = file.out, file.content
     for name, colour in file.colours.items():

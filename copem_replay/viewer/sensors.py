@@ -10,7 +10,8 @@ import numpy as np
 from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import Float, Tracks
 from copem_replay.experiment.schema import Experiment, Unit
-from copem_replay.perception.pem.condition import Condition, Couple
+from copem_replay.perception.field_of_view import outlines
+from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.sensor_poses import UnitPoses, carrier, list_instants, mounting_height, unit_ground
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.palette import EGO, FIELD
@@ -26,7 +27,6 @@ APART_M, NAMED_WITHIN_M = 12.0, 110.0
 FIELD_ALPHA = 10
 """How opaque the ground is in a field of view: where many see, it is brighter (chosen)."""
 
-_ARC_STEP_RAD = np.deg2rad(3)  # chosen: a chord of 80 m is 3 cm off the arc
 _ABOVE_GROUND_M = 0.05
 
 
@@ -108,27 +108,6 @@ def _recorded_place(replay: Replay, experiment: Experiment, unit: Unit, time_s: 
         high_m = at["height_m"] / 2 if unit.height_m is None else unit.height_m - at["height_m"] / 2
         place[there] = np.stack([at["x_m"], at["y_m"], at["z_m"] + high_m], axis=-1)[there]
     return place
-
-
-def outlines(pem: tuple[Couple, ...]) -> list[np.ndarray]:
-    """Borders (K, 2) of where the couples of a PEM apply, ahead along x; none for a couple that ends nowhere."""
-    fields = dict.fromkeys((c.when.range_m, c.when.azimuth_deg) for c in pem)
-    return [border for field in fields for border in _outline(Condition(range_m=field[0], azimuth_deg=field[1]))]
-
-
-def _outline(when: Condition) -> list[np.ndarray]:
-    if when.range_m is None:
-        return []
-    near_m, far_m = when.range_m
-    first, last = np.deg2rad(when.azimuth_deg or (-180.0, 180.0))
-    all_around = last - first >= 2 * np.pi - 1e-9
-    span = 2 * np.pi if all_around else np.mod(last - first, 2 * np.pi)
-    angle = first + np.linspace(0, span, int(np.ceil(span / _ARC_STEP_RAD - 1e-9)) + 1)
-    arc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    if all_around:
-        return [radius_m * arc for radius_m in (near_m, far_m) if radius_m > 0]
-    inner = near_m * (arc[::-1] if near_m > 0 else arc[:1])
-    return [np.concatenate([inner[-1:], far_m * arc, inner])]
 
 
 def _field(

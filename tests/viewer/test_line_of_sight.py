@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from copem_replay.perception.field_of_view import outlines
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.viewer.line_of_sight import sight
-from copem_replay.viewer.sensors import named_units, outlines
+from copem_replay.viewer.sensors import named_units
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, SEES_ALL, Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import Made, at, chunks, make, rows, static
 

@@ -40,7 +40,7 @@ class Statuses:
     """The statuses of the measured objects of one run; `table`: its rows of this log and configuration."""
 
     def __init__(self, scene: Scene, fused_tracks: FusedTracks, table: pd.DataFrame) -> None:
-        self._belief = fused_tracks
+        self._fused_tracks = fused_tracks
         self._known_ns = {
             scene.object_number[row.object_id]: scene.t0_ns + round(row.detection_s * 1e9) if row.detected else None
             for row in table[["object_id", "detected", "detection_s"]].itertuples(index=False)
@@ -49,12 +49,12 @@ class Statuses:
 
     def at(self, frame: int, available_ns: int) -> Iterator[tuple[str, str, float | None]]:
         """Id and status of each object, and how old its entry is, with list `frame` as it became available."""
-        rows = self._belief.listed(frame)
+        rows = self._fused_tracks.listed(frame)
         available_s = (available_ns - self._t0_ns) * 1e-9
-        captured_s = self._belief.captured_s[0]
+        captured_s = self._fused_tracks.captured_s[0]
         ages = {
             number: round(max(0.0, available_s - float(captured_s[row])), 6)
-            for row, number in zip(rows, self._belief.fused.row_object_ix[rows].tolist(), strict=True)
+            for row, number in zip(rows, self._fused_tracks.fused.row_object_ix[rows].tolist(), strict=True)
         }
         for number, known_ns in self._known_ns.items():
             known = known_ns is not None and available_ns >= known_ns - SAME_INSTANT_NS

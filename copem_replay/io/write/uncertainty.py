@@ -26,7 +26,7 @@ class UncertaintyWriter:
     """Turns the fused lists of one run (values (1, P)) into scenes of ellipses, list by list."""
 
     def __init__(self, scene: Scene, fused_tracks: FusedTracks, colour: Rgb, encode: Encode) -> None:
-        self._scene, self._belief, self._encode = scene, fused_tracks, encode
+        self._scene, self._fused_tracks, self._encode = scene, fused_tracks, encode
         self._colour = colour[0] / 255, colour[1] / 255, colour[2] / 255
         fused, rows = fused_tracks.fused, len(fused_tracks.fused.frame_ix)
         ee, en, nn = (
@@ -43,7 +43,7 @@ class UncertaintyWriter:
     def message(self, frame: int, available_ns: int) -> bytes:
         """List number `frame` as it became available at `available_ns` of the log's clock."""
         available_s = (available_ns - self._scene.t0_ns) * 1e-9
-        rows = [row for row in self._belief.listed(frame) if self._drawn[row]]
+        rows = [row for row in self._fused_tracks.listed(frame) if self._drawn[row]]
         return self._encode([self._entity(row, available_s) for row in rows], available_ns)
 
     def _entity(self, row: int, available_s: float) -> Entity:
@@ -53,7 +53,7 @@ class UncertaintyWriter:
         colour: Rgba = (*self._colour, FRESH_ALPHA + (OLDEST_ALPHA - FRESH_ALPHA) * faded)
         major, minor, *place = self._values[row]
         size = 2 * SIGMAS * major, 2 * SIGMAS * minor, _THIN_M
-        name = self._belief.name_of(self._scene, row)
+        name = self._fused_tracks.name_of(self._scene, row)
         return Entity(name, {"age_s": f"{age_s:.3f}"} if told else {}, ellipses=[Ellipse(size, colour, Pose(*place))])
 
 
