@@ -7,7 +7,7 @@ once. A trace becomes a channel.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from typing import Protocol, cast
@@ -55,32 +55,47 @@ def _source(log: Log) -> Source:
     return _OfTrace(log) if isinstance(log, Trace) else Original(log)
 
 
+class _Several:
+    """The channels and records of several files, numbered through; whose number is whose."""
+
+    def __init__(self, files: Sequence[Source]) -> None:
+        self.metadata: dict[str, dict[str, str]] = {}
+        for file in files:
+            for name, record in file.metadata.items():
+                self.metadata.setdefault(name, {}).update(record)
+        every = [(k, number, c) for k, file in enumerate(files) for number, c in file.channels.items()]
+        self._place = {place: (k, number) for place, (k, number, _) in enumerate(every)}
+        self.channels = {place: channel for place, (_, _, channel) in enumerate(every)}
+        self._count = len(files)
+
+    def numbered_through(self, numbers: Sequence[dict[int, int]]) -> dict[int, int]:
+        """By channel its number in the output, from those of each file."""
+        return {place: numbers[k][n] for place, (k, n) in self._place.items() if n in numbers[k]}
+
+    def by_file(self, numbers: Mapping[int, int]) -> list[dict[int, int]]:
+        """The same file by file, by the file's own numbers."""
+        result: list[dict[int, int]] = [{} for _ in range(self._count)]
+        for place, number in numbers.items():
+            k, theirs = self._place[place]
+            result[k][theirs] = number
+        return result
+
+
 class _OfBag:
     def __init__(self, bag: Bag) -> None:
         self._files = [Original(part.log) for part in bag.parts]
+        self._several = _Several(self._files)
         self.profile = self._files[0].profile
-        self.metadata: dict[str, dict[str, str]] = {}
-        for file in self._files:
-            for name, record in file.metadata.items():
-                self.metadata.setdefault(name, {}).update(record)
-        every = [(k, number, c) for k, file in enumerate(self._files) for number, c in file.channels.items()]
-        self._place = {place: (k, number) for place, (k, number, _) in enumerate(every)}
-        self.channels = {place: channel for place, (_, _, channel) in enumerate(every)}
+        self.metadata, self.channels = self._several.metadata, self._several.channels
         whole = not bag.lost and not any(file.damage for file in self._files)
         self.damage = None if whole else "damaged: its messages are copied as far as they can be read"
 
     def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        numbers = [file.register(catalogue, without) for file in self._files]
-        return {place: numbers[k][n] for place, (k, n) in self._place.items() if n in numbers[k]}
+        return self._several.numbered_through([file.register(catalogue, without) for file in self._files])
 
     def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        of_file: list[dict[int, int]] = [{} for _ in self._files]
-        for place, number in numbers.items():
-            k, theirs = self._place[place]
-            of_file[k][theirs] = number
-        return merged(
-            [(f.start_ns, partial(f.messages, mine)) for f, mine in zip(self._files, of_file, strict=True) if mine]
-        )
+        each = zip(self._files, self._several.by_file(numbers), strict=True)
+        return merged([(file.start_ns, partial(file.messages, mine)) for file, mine in each if mine])
 
 
 class _Named:
@@ -103,33 +118,25 @@ class _OfJoined:
         self._files = [_source(part.log) for part in log.parts]
         profiles = {file.profile for file in self._files}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        self.metadata: dict[str, dict[str, str]] = {}
-        for file in self._files:
-            for name, record in file.metadata.items():
-                self.metadata.setdefault(name, {}).update(record)
+        self._all = _Several(self._files)
+        self.metadata, self.channels = self._all.metadata, self._all.channels
         counts = Counter(topic for file in self._files for topic in {c.topic for c in file.channels.values()})
-        self._several = {topic for topic, count in counts.items() if count > 1}
-        every = [(k, number, c) for k, file in enumerate(self._files) for number, c in file.channels.items()]
-        self._place = {place: (k, number) for place, (k, number, _) in enumerate(every)}
-        self.channels = {place: channel for place, (_, _, channel) in enumerate(every)}
+        self._shared = {topic for topic, count in counts.items() if count > 1}
         self.damage = next((file.damage for file in self._files if file.damage), None)
 
     def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
         numbers = [
-            file.register(cast("Catalogue", _Named(catalogue, part, self._several)), without)
+            file.register(cast("Catalogue", _Named(catalogue, part, self._shared)), without)
             for file, part in zip(self._files, self._parts, strict=True)
         ]
-        return {place: numbers[k][n] for place, (k, n) in self._place.items() if n in numbers[k]}
+        return self._all.numbered_through(numbers)
 
     def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        of_file: list[dict[int, int]] = [{} for _ in self._files]
-        for place, number in numbers.items():
-            k, theirs = self._place[place]
-            of_file[k][theirs] = number
+        each = zip(self._files, self._parts, self._all.by_file(numbers), strict=True)
         return merged(
             [
                 (part.log.start_ns - part.ahead_ns, partial(_moved, file, mine, part.ahead_ns))
-                for file, part, mine in zip(self._files, self._parts, of_file, strict=True)
+                for file, part, mine in each
                 if mine
             ]
         )
