@@ -1,6 +1,6 @@
 """Calibrate the sample scenario to the paper's success rates, and say how well and how surely.
 
-    python tools/calibrate_tc016d.py            # prints docs/calibration.md
+    python tools/calibrate_tc016d.py            # prints docs/reference/calibration.md
 
 The paper gives six success rates and neither its driver nor its geometry. Four numbers of ours are fitted to the
 rates, by maximum likelihood of the paper's counts given our exact rates: the driver's deceleration a_max, shape and
@@ -155,7 +155,7 @@ def calibrate() -> tuple[Scenario, np.ndarray, Parameters]:
 
 
 def page() -> str:
-    """docs/calibration.md."""
+    """docs/reference/calibration.md."""
     scenario, latest_s, fitted = calibrate()
     rates = scenario.rates(fitted, latest_s)
     lines = [

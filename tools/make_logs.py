@@ -114,7 +114,7 @@ _EGO_START_M: Final = -(20.0 + 4.6 / 2 + 10.0 * TC016D_ONSET_S) + 1e-10
 
 
 TC016D_TRUCK_EDGE_M: Final = -2.12
-"""Road side of the truck, calibrated (docs/calibration.md)."""
+"""Road side of the truck, calibrated (docs/reference/calibration.md)."""
 
 
 def tc016d_bodies(truck_edge_m: float = TC016D_TRUCK_EDGE_M) -> tuple[list[Body], list[Body]]:

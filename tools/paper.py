@@ -50,7 +50,7 @@ def main() -> None:
         parser.error(f"{folder}: expected a results folder: {error.strerror}")
     if not set(PASSED) <= set(summary["configuration"]) or "pass_share_exact" not in summary:
         parser.error(f"{folder}: expected the results of logs/tc016d.yaml")
-    print("Success rates beside the paper's (calibrated to them: docs/calibration.md)")
+    print("Success rates beside the paper's (calibrated to them: docs/reference/calibration.md)")
     print(as_text(beside(summary)))
 
 

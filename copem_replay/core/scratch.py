@@ -1,7 +1,7 @@
 """Folders to write in: locked as long as their process lives, with a list of what is in them.
 
 `.NAME.xxxxxxxx.tmp` beside NAME. When its process is killed it stays, its lock free; what its list names is then
-removed by `remove_leftovers`, and only that: docs/decisions/0020-results-folder.md.
+removed by `remove_leftovers`, and only that: docs/develop/decisions/0020-results-folder.md.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def choose_topic(
     if not topics:
         raise RecordingError(
             f"no list of true objects; it holds {_listed(log.channels)}; "
-            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)",
+            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)",
             path=log.path,
         )
     if topic is not None and topic not in topics:

@@ -2,7 +2,7 @@
 
 Onset: the first frame at which its condition holds while the ego is in the log. The episode ends at the object's own
 last frame (`object_left`: not seen by then, it is never detected), the ego's (`ego_left`) or the log's (`log_end`);
-only the last two are censoring. Source of the meanings: docs/measures.md.
+only the last two are censoring. Source of the meanings: docs/guide/metrics.md.
 """
 
 from __future__ import annotations

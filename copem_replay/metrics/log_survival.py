@@ -4,7 +4,7 @@ Lists are independent given the truth, but where detection lasts (`lasting_survi
 probability p. What is carried on from instant to instant is the logarithm of the probability that the object is not
 known yet, and nothing is one minus its complement.
 Beside it goes d ln P(never) / dδ, δ being added to the log-odds of every p: how much the tail hangs on error models.
-Letters of the shapes: P lists of one object, K instants at which some arrive. Definitions: docs/measures.md.
+Letters of the shapes: P lists of one object, K instants at which some arrive. Definitions: docs/guide/metrics.md.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ class RowMetric(Component, ABC):
     def statistics(self, rows: pd.DataFrame) -> Mapping[str, Float]:
         """Named statistics (n,) of the n rows of one configuration in one log, in the order of run and object.
 
-        Columns: docs/measures.md. Each statistic is then summed over rows and logs.
+        Columns: docs/guide/metrics.md. Each statistic is then summed over rows and logs.
         """
 
     @abstractmethod

@@ -1,7 +1,7 @@
 """Onsets: the condition that starts the clock of a measured object, as components.
 
 An own onset derives from `Onset` and answers `holds`; the experiment names it with `kind: package.module:Class`. The
-meanings of the built-in ones: docs/measures.md.
+meanings of the built-in ones: docs/guide/metrics.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a unit gets wrong beside its PEM: its own pose, its clock, and that for a while it makes no lists. Keys.
 
-What comes of them: `pose_error.py`, `clock.py`, `outages.py`. docs/unit-errors.md.
+What comes of them: `pose_error.py`, `clock.py`, `outages.py`. docs/guide/unit-errors.md.
 """
 
 from __future__ import annotations

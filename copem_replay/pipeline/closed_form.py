@@ -5,7 +5,7 @@ P(T > t) = Π (1 − p) over all lists that have arrived by t. Where detection l
 independent, and a filter gives the factors (metrics/lasting_survival.py). Confirmation by k of n is a Markov chain over
 the last n − 1 capture instants where all units capture together and their lists arrive together; elsewhere it has no
 such form, and is refused. Both are worked out in metrics/log_survival.py. With the distribution of the reaction follow
-the probabilities to pass and to fail. docs/measures.md has the definitions.
+the probabilities to pass and to fail. docs/guide/metrics.md has the definitions.
 """
 
 from __future__ import annotations

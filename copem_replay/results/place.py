@@ -1,6 +1,6 @@
 """The place of a results folder, from the start of a run: refused, locked, tidied up, and in the end exchanged.
 
-docs/decisions/0020-results-folder.md
+docs/develop/decisions/0020-results-folder.md
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ def test_git_lfs_pointer(path):
     assert problem(path) == "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
 
 
-MADE = "; docs/converters.md says what makes a recording of such files"
+MADE = "; docs/guide/data-sets.md says what makes a recording of such files"
 BYTES = "a file whose first bytes are"
 
 

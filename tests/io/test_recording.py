@@ -215,7 +215,7 @@ def test_no_channel_with_objects(path):
     assert problem(path) == (
         "no list of true objects; it holds nav_msgs/msg/Odometry (cdr) on /odom, osi3.SensorData on rsu, "
         "osi3.GroundTruth (json) on truth; "
-        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
+        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
     )
 
 

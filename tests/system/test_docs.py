@@ -44,8 +44,8 @@ def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
     ("page", "runs_before", "shown"),
     [
         ("README.md", [], ["copem-replay run"]),
-        ("docs/worked_example.md", ["copem-replay run"], ["python tools/paper.py"]),
-        ("docs/which_fusion.md", ["copem-replay run"] * 2, ["copem-replay compare"] * 2),
+        ("docs/tutorial.md", ["copem-replay run"], ["python tools/paper.py"]),
+        ("docs/guide/which-fusion.md", ["copem-replay run"] * 2, ["copem-replay compare"] * 2),
     ],
 )
 def test_pages_show_what_their_commands_print(
@@ -82,11 +82,11 @@ def test_pages_show_what_their_commands_print(
 
 def test_all_outputs_on_pages_are_tested() -> None:
     marked = [page for page in PAGES if "<!-- output: " in page.read_text(encoding="utf-8")]
-    assert sorted(page.name for page in marked) == ["README.md", "which_fusion.md", "worked_example.md"]
+    assert sorted(page.name for page in marked) == ["README.md", "tutorial.md", "which-fusion.md"]
 
 
 def test_experiments_on_the_page_load(tmp_path: Path) -> None:
-    text = (ROOT / "docs/experiment.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/guide/experiment.md").read_text(encoding="utf-8")
     blocks = re.findall(r"<!-- experiment -->\n```yaml\n(.*?)```", text, re.DOTALL)
     assert blocks
     for k, block in enumerate(blocks):
@@ -98,7 +98,7 @@ def test_experiments_on_the_page_load(tmp_path: Path) -> None:
 
 
 def test_python_of_the_experiment_page_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    text = (ROOT / "docs/experiment.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/guide/experiment.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (tmp_path / "logs").symlink_to(ROOT / "logs")
     monkeypatch.chdir(tmp_path)
@@ -113,7 +113,7 @@ def test_python_of_the_experiment_page_runs(monkeypatch: pytest.MonkeyPatch, tmp
 
 
 def test_pages_and_notebooks_use_the_public_api_alone() -> None:
-    text = (ROOT / "docs/experiment.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/guide/experiment.md").read_text(encoding="utf-8")
     code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     for path in sorted(ROOT.glob("notebooks/*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
@@ -128,7 +128,7 @@ def test_pages_and_notebooks_use_the_public_api_alone() -> None:
 @pytest.fixture
 def architecture(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The Python of the architecture page, as the module `page`."""
-    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/develop/architecture.md").read_text(encoding="utf-8")
     page = ModuleType("page")
     for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(code, vars(page))
@@ -167,7 +167,7 @@ def test_own_link_of_the_architecture_page_works(architecture: ModuleType) -> No
 
 
 def test_own_fusion_of_the_fusion_page_works() -> None:
-    text = (ROOT / "docs/fusion.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/guide/fusion.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     namespace: dict[str, object] = {"__name__": "page"}
     exec(code, namespace)
@@ -185,7 +185,7 @@ def test_links_within_the_project_lead_somewhere(page: Path) -> None:
 
 
 def test_architecture_names_every_file() -> None:
-    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/develop/architecture.md").read_text(encoding="utf-8")
     for path in (ROOT / "copem_replay").rglob("*.py"):
         name = path.relative_to(ROOT / "copem_replay").as_posix()
         folder = name.split("/")[0] + "/" if "/" in name else None
@@ -193,7 +193,7 @@ def test_architecture_names_every_file() -> None:
 
 
 def test_decisions_fit_on_a_page() -> None:
-    pages = sorted((ROOT / "docs/decisions").glob("*.md"))
+    pages = sorted((ROOT / "docs/develop/decisions").glob("*.md"))
     assert [int(path.name[:4]) for path in pages[:17]] == list(range(1, 18))
     for path in pages:
         assert len(path.read_text(encoding="utf-8").splitlines()) <= 30, path.name

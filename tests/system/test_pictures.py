@@ -21,7 +21,7 @@ from pictures import LARGEST_BYTES, PICTURES, as_png  # noqa: E402
 
 def test_every_picture_is_shown_with_words_that_say_what_is_on_it() -> None:
     shown = {}
-    for page in (ROOT / "README.md", *ROOT.glob("docs/*.md")):
+    for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md")):
         for words, target in re.findall(r"!\[(.*?)\]\((.*?)\)", page.read_text(encoding="utf-8")):
             shown[(page.parent / target).resolve()] = words
     assert set(shown) == set(PICTURES.iterdir())

@@ -58,7 +58,7 @@ def test_the_table_of_the_page_about_memory_is_what_its_tool_prints() -> None:
     done = subprocess.run(
         [sys.executable, "tools/memory_table.py"], cwd=ROOT, check=True, capture_output=True, text=True
     )
-    assert done.stdout in (ROOT / "docs/perception-models.md").read_text(encoding="utf-8")
+    assert done.stdout in (ROOT / "docs/guide/perception-models.md").read_text(encoding="utf-8")
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:6]]
     for rate_hz, fresh, sampled, held, held_sampled in (map(float, row) for row in rows):
         assert fresh == pytest.approx(0.7 ** (rate_hz + 1), abs=6e-5)
@@ -209,7 +209,7 @@ def test_misfit_by_hand() -> None:
 def test_calibration_is_what_the_page_says_and_the_experiment_has() -> None:
     """The fit again: the same page; its parameters are those of the experiment and of the recording."""
     page = calibrate_tc016d.page()
-    assert page == (ROOT / "docs/calibration.md").read_text(encoding="utf-8")
+    assert page == (ROOT / "docs/reference/calibration.md").read_text(encoding="utf-8")
     experiment, _ = problems(load(ROOT / "logs/tc016d.yaml"))
     assert experiment is not None
     assert experiment.braking is not None

@@ -35,7 +35,7 @@ class StudyResult:
 
     `detections`: a row per log, configuration, run and measured object. `summary`: a row per configuration.
     `exact`, `sweep`, `accuracy`, `bands`: None where the experiment does not ask for them. Times are in seconds (`_s`),
-    distances in metres (`_m`); missing values are null. Source of each column: docs/measures.md.
+    distances in metres (`_m`); missing values are null. Source of each column: docs/guide/metrics.md.
 
     >>> result = cr.run({"version": 1, "configurations": {"GT": {"units": "truth"}}}, "logs/tc016d.mcap")
     >>> result.detections.shape[0], result.exact is None

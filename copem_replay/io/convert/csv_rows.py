@@ -1,4 +1,4 @@
-"""A table with one row per object and instant, the units in the names of its columns (docs/converters.md)."""
+"""A table with one row per object and instant, the units in the names of its columns (docs/guide/data-sets.md)."""
 
 from __future__ import annotations
 

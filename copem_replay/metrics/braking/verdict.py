@@ -4,7 +4,7 @@ A verdict is a function of the encounter and of the instant at which braking beg
 the ego is where its driver has braked to, along its own path, and never farther than it would have been without. It
 passes when it stays more than the margin from the object's true motion throughout: it has stopped in time, or the
 object has left its way. The others do not react. Source of the idea: Piazzoni et al. 2022; definitions:
-docs/measures.md.
+docs/guide/metrics.md.
 """
 
 from __future__ import annotations

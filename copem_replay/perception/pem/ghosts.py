@@ -1,6 +1,6 @@
 """Ghosts: entries about nobody. How many there are, how long they last, where they are, and what they look like. Keys.
 
-What comes of them in a run: `perception/ghosts.py`. docs/unit-errors.md.
+What comes of them in a run: `perception/ghosts.py`. docs/guide/unit-errors.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Memory of a PEM: which of its draws last, for how long, and who has them in common. Keys of the experiment file.
 
-Models do not know of it: what changes is which numbers they are handed. docs/perception-models.md.
+Models do not know of it: what changes is which numbers they are handed. docs/guide/perception-models.md.
 """
 
 from __future__ import annotations
