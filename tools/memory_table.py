@@ -1,4 +1,6 @@
-"""How long an object stays unknown, by list rate, without memory and with it; printed for docs/guide/perception-models.md.
+"""How long an object stays unknown, by list rate, without memory and with it.
+
+Printed for docs/guide/perception-models.md.
 
     python tools/memory_table.py
 

@@ -2,7 +2,8 @@
 
 time_to_detection_s: from the onset to the instant the list that confirmed the object was available; null when never.
 distance_at_detection_m: true horizontal distance between the centres of object and ego at that instant.
-gap_at_detection_m: the same from box to box. Source: Piazzoni et al. 2022 (distance at detection), docs/guide/metrics.md.
+gap_at_detection_m: the same from box to box.
+Source: Piazzoni et al. 2022 (distance at detection); docs/guide/metrics.md.
 """
 
 from __future__ import annotations
