@@ -3,8 +3,8 @@
 python tools/mutate.py [--mutants 100] [--seed 0] [--from 0] [--only 7] [--out out/mutants.csv]
 
 Works on a copy. Of each mutant the tests that import its module come first, then those of its wing, then the others but
-notebooks, docs and browsers. A mutant that ends within no reasonable time is killed, too, and said. Survivors are for a reader: some
-change nothing that can be told (equivalent), the others want a test.
+notebooks, docs and browsers. What ends within no reasonable time is killed, too. The test that fails is named. Survivors are
+for a reader: some change nothing that can be told (equivalent), the others want a test.
 """
 
 from __future__ import annotations
@@ -122,8 +122,8 @@ def chosen(count: int, seed: int) -> list[Mutant]:
     return [rng.choice(module) for module in order[:count]]
 
 
-def killed_by(mutant: Mutant, copy: Path) -> str:
-    """Which tests tell a mutant: `module`, `wing`, `all`, `time` where none ends, or `` where none does."""
+def killed_by(mutant: Mutant, copy: Path) -> tuple[str, str]:
+    """Among which tests (`module`, `wing`, `all`) one tells a mutant, and its name; ("", "") where none does."""
     place = copy / mutant.path.relative_to(ROOT)
     kernel = "njit" in mutant.text
     env = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"}
@@ -147,12 +147,13 @@ def killed_by(mutant: Mutant, copy: Path) -> str:
                         timeout=_LONGEST_S[stage] * (3 if kernel else 1),
                     )  # fmt: skip
                 except subprocess.TimeoutExpired:
-                    return "time"
+                    return stage, "no end"
                 if done.returncode not in (0, 5):
-                    return stage
+                    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout.decode(), re.MULTILINE)
+                    return stage, failed[0] if failed else "no test began"
         finally:
             shutil.copy2(mutant.path, place)
-    return ""
+    return "", ""
 
 
 def _stages(mutant: Mutant, copy: Path) -> Iterator[tuple[str, list[str]]]:
@@ -185,11 +186,13 @@ def main() -> None:
         write = csv.writer(file)
         killed = 0
         for number, mutant in mutants:
-            stage = killed_by(mutant, copy)
+            stage, test = killed_by(mutant, copy)
             killed += bool(stage)
-            write.writerow([number, mutant.path.relative_to(ROOT), mutant.line, mutant.before, mutant.after, stage])
+            write.writerow(
+                [number, mutant.path.relative_to(ROOT), mutant.line, mutant.before, mutant.after, stage, test]
+            )
             file.flush()
-            print(f"{number:3d} {'killed by ' + stage if stage else 'SURVIVES':17s} {mutant}", flush=True)
+            print(f"{number:3d} {stage or 'SURVIVES':8s} {mutant}  {test}", flush=True)
     print(f"{killed} of {len(mutants)} killed")
 
 
