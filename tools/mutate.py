@@ -3,8 +3,8 @@
 python tools/mutate.py [--mutants 100] [--seed 0] [--from 0] [--only 7] [--out out/mutants.csv]
 
 Works on a copy. Of each mutant the tests that import its module come first, then those of its wing, then the others but
-notebooks, docs and browsers. What ends within no reasonable time is killed, too. The test that fails is named. Survivors are
-for a reader: some change nothing that can be told (equivalent), the others want a test.
+notebooks, docs and browsers. What ends within no reasonable time is killed, too. The test that fails is named.
+Survivors are for a reader: some change nothing that can be told (equivalent), the others want a test.
 """
 
 from __future__ import annotations
