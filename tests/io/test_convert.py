@@ -192,7 +192,7 @@ def test_the_page_shows_commands_that_are_understood_and_a_table_that_converts(r
     from copem_replay.io.convert.kinds import KINDS
 
     group = typer.main.get_group(convert_command.app)
-    page = (ROOT / "docs" / "converters.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/guide/data-sets.md").read_text(encoding="utf-8")
     commands = re.findall(r"`copem-replay convert (.*?)`", page)
     assert len(commands) == 8
     for command in commands:

@@ -27,7 +27,7 @@ from tests.helpers import experiments
 from tests.helpers.report_pages import Page, changed, replayed
 
 EVERY = "measure: {onset"
-DOCS = Path(__file__).parents[2] / "docs" / "measures.md"
+DOCS = Path(__file__).parents[2] / "docs/guide/metrics.md"
 
 
 class LateShare(RowMetric):

@@ -219,7 +219,7 @@ def test_what_is_not_said_is_not_written() -> None:
 
 def test_the_guide_holds(tmp_path: Path) -> None:
     """The example of docs/guide/unit-errors.md is an experiment."""
-    text = (Path(__file__).parents[2] / "docs" / "unit-errors.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs/guide/unit-errors.md").read_text(encoding="utf-8")
     example = text.partition("```yaml\n")[2].partition("```")[0]
     whole = "version: 1\nlogs: [a.mcap]\nconfigurations: {all: {units: all, fusion: {kind: gnn}}}\n" + example
     (tmp_path / "a.mcap").touch()
