@@ -55,11 +55,14 @@ class Resamples:
 
 
 def clusters(table: pd.DataFrame) -> tuple[str | None, pd.Series]:
-    """What is resampled whole (`runs`, `logs`, `objects`; None: too few of either), and each row's cluster (n,)."""
+    """What is resampled whole (`runs`, `logs`, `objects`; None: too few of either), and each row's cluster (n,).
+
+    Rows of a tally are of several runs: where runs are resampled they are of one cluster.
+    """
     log = table["log"].astype(str)
     thing = log + "\n" + table["object_id"].astype(str)
     if thing.nunique() == 1:
-        return "runs", table["run"].astype(str)
+        return "runs", table["run"].astype(str) if "run" in table else thing
     if log.nunique() >= FEWEST_CLUSTERS:
         return "logs", log
     return ("objects" if thing.nunique() >= FEWEST_CLUSTERS else None), thing

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -24,14 +25,18 @@ if TYPE_CHECKING:
     from copem_replay.metrics.output_times import OutputTimes
 
 Value = float | int | str | None
+OwnSums = dict[str, float]
+"""Sums of an own metric over rows and logs, by their names; empty without rows."""
 
 
 @dataclass(frozen=True)
 class Given:
     """What the statistics of one configuration are made from, over all logs, runs and measured objects.
 
-    `rows`: its rows of `detections.parquet`, log by log. `lists_fixed`, `reaction_fixed`: known alike, braking alike in
-    every run. `accuracy`, `exact`: None where the experiment asks for neither. `output`: of a stack's recorded output.
+    `rows`: its rows of `tally.parquet` of being detected, log by log; `conflicts`: of a collision being implied, None
+    where that is not asked for. `lists_fixed`, `reaction_fixed`: known alike, braking alike in every run. `accuracy`,
+    `exact`: None where the experiment asks for neither. `output`: of a stack's recorded output. `own`: sums of own
+    metrics, by name.
     """
 
     rows: pd.DataFrame
@@ -43,6 +48,8 @@ class Given:
     accuracy: Total | None = None
     exact: pd.DataFrame | None = None  # its rows of exact.parquet
     output: OutputTimes | None = None
+    conflicts: pd.DataFrame | None = None
+    own: Mapping[str, OwnSums] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -116,15 +123,15 @@ def own_metrics(components: Sequence[RowMetric]) -> tuple[Metric, ...]:
 
 
 def _column(k: int, own: RowMetric) -> Metric:
-    where = f"measure.metrics[{k}]"
-
-    def value(sums: Mapping[str, float]) -> float | None:
-        found = asked(own, where, lambda: _number(own.value(sums))) if sums else None
+    def value(sums: OwnSums) -> float | None:
+        found = asked(own, _where(k), lambda: _number(own.value(sums))) if sums else None
         return None if found is None or np.isnan(found) else found
 
-    return Metric(
-        own.name, lambda given: asked(own, where, lambda: _sums(own, given.rows)), value, own.better, own.help, OWN
-    )
+    return Metric(own.name, lambda given: given.own.get(own.name, {}), value, own.better, own.help, OWN)
+
+
+def _where(k: int) -> str:
+    return f"measure.metrics[{k}]"
 
 
 def _number(value: Any) -> float | None:
@@ -135,13 +142,19 @@ def _number(value: Any) -> float | None:
     return float(value)
 
 
-def _sums(own: RowMetric, rows: pd.DataFrame) -> dict[str, float]:
-    """Sums over rows and logs; empty without rows."""
-    sums: dict[str, float] = {}
-    for _, part in rows.groupby("log", sort=False):
-        for name, of_rows in own.statistics(part.reset_index(drop=True)).items():
-            column = np.asarray(of_rows, dtype=float)
-            if column.shape != (len(part),):
-                raise GivenError("statistics", f"{name}: expected shape ({len(part)},), found {column.shape}")
-            sums[name] = sums.get(name, 0.0) + float(column.sum())
+def own_sums(components: Sequence[RowMetric], rows: pd.DataFrame) -> dict[str, OwnSums]:
+    """By the names of own metrics their sums over rows of `detections.parquet`, of one configuration in one log."""
+    if not len(rows):
+        return {}
+    rows = rows.reset_index(drop=True)
+    return {own.name: asked(own, _where(k), partial(_sums, own, rows)) for k, own in enumerate(components)}
+
+
+def _sums(own: RowMetric, rows: pd.DataFrame) -> OwnSums:
+    sums: OwnSums = {}
+    for name, of_rows in own.statistics(rows).items():
+        column = np.asarray(of_rows, dtype=float)
+        if column.shape != (len(rows),):
+            raise GivenError("statistics", f"{name}: expected shape ({len(rows)},), found {column.shape}")
+        sums[name] = float(column.sum())
     return sums

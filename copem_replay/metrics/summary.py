@@ -6,6 +6,7 @@ Its columns are metrics: metrics/summary_metrics.py, and the own ones of the exp
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pandas as pd
 
@@ -13,9 +14,10 @@ from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import Total
 from copem_replay.metrics.fixed import Fixed
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
-from copem_replay.metrics.metric import Given, RowMetric, own_metrics, values
+from copem_replay.metrics.metric import Given, OwnSums, RowMetric, own_metrics, own_sums, values
 from copem_replay.metrics.output_times import OutputTimes
 from copem_replay.metrics.summary_metrics import METRICS
+from copem_replay.metrics.tally import CONFLICT, DETECTED, tally
 
 MUCH_BEYOND = 0.01
 """From this share of errors beyond the gate on it is said (chosen)."""
@@ -28,8 +30,39 @@ def horizon_s(table: pd.DataFrame, given_s: float | None) -> float | None:
     return float((table["ended_s"] - table["onset_s"]).max()) if len(table) else None
 
 
+Sums = Mapping[str, Mapping[str, OwnSums]]
+"""Of own metrics, by configuration and name."""
+
+
 def summary(
-    table: pd.DataFrame,
+    rows: pd.DataFrame, configurations: Sequence[str], list_rate_hz: Mapping[str, float | None], **given: Any
+) -> tuple[pd.DataFrame, list[str]]:
+    """The rows of `summary.csv` of rows of `detections.parquet`, otherwise as `summary_of`."""
+    own, asked = own_sums_of(rows, given.get("own", ())), "conflict_detected" in rows
+    return summary_of(tally(rows), configurations, list_rate_hz, sums=own, conflicts_asked=asked, **given)
+
+
+def own_sums_of(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
+    """Of rows of `detections.parquet`, log by log."""
+    sums: dict[str, dict[str, OwnSums]] = {}
+    for (_, name), part in rows.groupby(["log", "configuration"], sort=False) if own else ():
+        sums = added(sums, {str(name): own_sums(own, part)})
+    return sums
+
+
+def added(sums: Sums, more: Sums) -> dict[str, dict[str, OwnSums]]:
+    """Sums of own metrics over some logs, and those of one more."""
+    result = {configuration: dict(of) for configuration, of in sums.items()}
+    for configuration, of in more.items():
+        mine = result.setdefault(configuration, {})
+        for metric, one in of.items():
+            before = mine.get(metric, {})
+            mine[metric] = before | {name: before.get(name, 0.0) + value for name, value in one.items()}
+    return result
+
+
+def summary_of(
+    tallied: pd.DataFrame,
     configurations: Sequence[str],
     list_rate_hz: Mapping[str, float | None],
     *,
@@ -39,24 +72,28 @@ def summary(
     accuracy: Mapping[str, Total] | None = None,
     fixed: Fixed | None = None,
     own: Sequence[RowMetric] = (),
+    sums: Sums | None = None,
     outputs: Mapping[str, OutputTimes] | None = None,
+    conflicts_asked: bool = False,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv`, and what has to be said about them.
+    """The rows of `summary.csv`, and what has to be said about them, of the rows of `tally.parquet`.
 
     `exact`: the rows of `exact.parquet`. `accuracy`: by configuration the sums its figures are made of.
-    `fixed`: what is the same in every run; None: nothing. `own`: the experiment's own metrics, whose columns come last.
-    `outputs`: how old the recorded outputs are, by configuration.
+    `fixed`: what is the same in every run; None: nothing. `own`: the experiment's own metrics, whose columns come last,
+    and `sums`, what they are made of. `outputs`: how old the recorded outputs are, by configuration.
+    `conflicts_asked`: whether it is measured when lists imply a collision.
     """
     notes: list[str] = []
     fixed = fixed or Fixed()
-    judged = table[table["conflict"]] if "conflict" in table else table.iloc[:0]
-    for what, rows_of, whom in (("detected", table, "measured objects"), ("pass", judged, "objects in conflict")):
+    known, implied = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
+    judged = known[known["in_conflict"]] if "in_conflict" in known else known.iloc[:0]
+    for what, rows_of, whom in (("detected", known, "measured objects"), ("pass", judged, "objects in conflict")):
         if len(rows_of) and clusters(rows_of)[0] is None:
             notes.append(
                 f"no interval of the {what} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
                 f"{whom}, and more runs do not tell about other traffic"
             )
-    parts = _by_configuration(table)
+    parts, conflicts = _by_configuration(known), _by_configuration(implied)
     exactly = _by_configuration(exact) if exact is not None else {}
     notes += _beyond_the_gate(accuracy or {})
     notes += _not_annotated(accuracy or {})
@@ -64,7 +101,7 @@ def summary(
     rows = []
     for name in configurations:
         given = Given(
-            parts.get(name, table.iloc[:0]),
+            parts.get(name, known.iloc[:0]),
             list_rate_hz[name],
             seed,
             horizon_s,
@@ -73,6 +110,8 @@ def summary(
             accuracy=accuracy[name] if accuracy else None,
             exact=exactly.get(name, exact.iloc[:0]) if exact is not None else None,
             output=(outputs or {}).get(name),
+            conflicts=conflicts.get(name, implied.iloc[:0]) if conflicts_asked else None,
+            own=(sums or {}).get(name, {}),
         )
         rows.append({"configuration": name, **values(columns, given)})
     return pd.DataFrame(rows), notes

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.accuracy.metrics import ACCURACY
@@ -45,7 +46,7 @@ class Detections:
     incidence: Float  # (M,) of detection
     distance_m: Float  # (n,) of the rows that can be ranked
     detected: Bool  # (n,)
-    weight: Float | None  # (n,); None: all alike
+    weight: Float  # (n,)
     horizon_s: float | None
     rows: bool
 
@@ -67,42 +68,40 @@ class Detections:
 
 
 def _detections(
-    part: pd.DataFrame,
-    detected: Bool,
-    names: tuple[str, str],
-    horizon_s: float | None,
-    weight: Float | None = None,
-    least: float = 1e-12,
+    part: pd.DataFrame, detected: Bool, weight: Float, horizon_s: float | None, least: float = 1e-12
 ) -> Detections:
-    """Statistics of rows; `names` of the columns of times and distances. Rows count by `weight (n,)`."""
+    """Statistics of rows, which count by `weight (n,)`."""
     if not len(part):
         nothing = np.empty(0)
-        return Detections(nothing, nothing, nothing, np.empty(0, dtype=bool), None, None, rows=False)
+        return Detections(nothing, nothing, nothing, np.empty(0, dtype=bool), nothing, None, rows=False)
     ending = np.where(detected, DETECTED, np.where(competes(part["ended_by"]), LEFT, CENSORED))
     looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
     # To a nanosecond: of equal times detections come first, and 1 − 0.8 is less than 0.2 − 0.
-    time_s = np.round(np.where(detected, part[names[0]].to_numpy(dtype=float), looked_s), 9)
+    time_s = np.round(np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), looked_s), 9)
     times, incidence = cumulative_incidence(time_s, ending, weight, least=least)
-    distance_m = part[names[1]].to_numpy(dtype=float)
+    distance_m = part["distance_at_detection_m"].to_numpy(dtype=float)
     placed = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
-    by = None if weight is None else weight[placed]
-    return Detections(times, incidence, distance_m[placed], detected[placed], by, horizon_s, rows=True)
+    return Detections(times, incidence, distance_m[placed], detected[placed], weight[placed], horizon_s, rows=True)
 
 
-_DETECTION = "time_to_detection_s", "distance_at_detection_m"
-_CONFLICT = "time_to_conflict_detection_s", "distance_at_conflict_detection_m"
+def _of_tally(rows: pd.DataFrame, horizon_s: float | None) -> Detections:
+    return _detections(rows, _known(rows), rows["runs"].to_numpy(dtype=float), horizon_s)
+
+
+def _known(rows: pd.DataFrame) -> Bool:
+    """(n,) whether rows are of an instant, not of never."""
+    known: Bool = rows["time_to_detection_s"].notna().to_numpy(dtype=bool)
+    return known
 
 
 def detections(given: Given) -> Detections:
     """When objects are detected, and how far away."""
-    return _detections(given.rows, given.rows["detected"].to_numpy(dtype=bool), _DETECTION, given.horizon_s)
+    return _of_tally(given.rows, given.horizon_s)
 
 
 def conflicts(given: Given) -> Detections | None:
     """The same of the second event: the first list that implies a collision."""
-    if "conflict_detected" not in given.rows:
-        return None
-    return _detections(given.rows, given.rows["conflict_detected"].to_numpy(dtype=bool), _CONFLICT, given.horizon_s)
+    return None if given.conflicts is None else _of_tally(given.conflicts, given.horizon_s)
 
 
 @dataclass(frozen=True)
@@ -117,18 +116,19 @@ class Share:
     high: float | None
 
 
-def _share(part: pd.DataFrame, success: Bool, seed: int, *, fixed: bool) -> Share:
-    """`fixed`: the successes are the same in every run."""
-    n = len(part)
-    share = success.mean() if n else None
+def _share(part: pd.DataFrame, successes: NDArray[np.int64], seed: int, *, fixed: bool) -> Share:
+    """Of rows of a tally so many successes (n,). `fixed`: they are the same in every run."""
+    n, total = int(part["runs"].sum()), int(successes.sum())
+    share = total / n if n else None
     over, cluster = clusters(part)
     if over is None or not n:
         return Share(n, share, None, None, None, None)
     if over == "runs":
         if fixed:
             return Share(n, share, NOTHING_DRAWN, None, None, None)
-        return Share(n, share, "wilson", over, *wilson(int(success.sum()), n))
-    counted = pd.Series(success).groupby(cluster.to_numpy(), sort=True).agg(["sum", "count"])
+        return Share(n, share, "wilson", over, *wilson(total, n))
+    columns = pd.DataFrame({"sum": successes, "count": part["runs"].to_numpy()})
+    counted = columns.groupby(cluster.to_numpy(), sort=True).sum()
     # Addressed by the clusters' names: every configuration resamples the same logs or objects.
     resampled = resamples([str(name) for name in counted.index], seed)
     kind, low, high = share_limits(
@@ -139,22 +139,24 @@ def _share(part: pd.DataFrame, success: Bool, seed: int, *, fixed: bool) -> Shar
 
 def detected(given: Given) -> Share:
     """The rows that are detected."""
-    return _share(given.rows, given.rows["detected"].to_numpy(dtype=bool), given.seed, fixed=given.lists_fixed)
+    runs = given.rows["runs"].to_numpy()
+    return _share(given.rows, np.where(_known(given.rows), runs, 0), given.seed, fixed=given.lists_fixed)
 
 
 def foreseen(given: Given) -> float | None:
     """The share of the rows in which a list implies a collision; NaN without rows."""
-    if "conflict_detected" not in given.rows:
+    if given.conflicts is None:
         return None
-    return float(given.rows["conflict_detected"].to_numpy(dtype=bool).mean()) if len(given.rows) else np.nan
+    runs = given.conflicts["runs"].to_numpy()
+    return int(runs[_known(given.conflicts)].sum()) / int(runs.sum()) if len(runs) else np.nan
 
 
 def passed(given: Given) -> Share | None:
     """The rows in conflict that pass."""
-    if "conflict" not in given.rows:
+    if "in_conflict" not in given.rows:
         return None
-    part = given.rows[given.rows["conflict"]]
-    return _share(part, part["braking_pass"].to_numpy(dtype=bool), given.seed, fixed=given.reaction_fixed)
+    part = given.rows[given.rows["in_conflict"]]
+    return _share(part, part["passed"].to_numpy(), given.seed, fixed=given.reaction_fixed)
 
 
 @dataclass(frozen=True)
@@ -177,11 +179,11 @@ def exact(given: Given) -> Exact | None:
         return None
     missed = _missed(part[part["detection_s"].isna()])
     if not len(part):
-        return Exact(None, _detections(part, np.empty(0, dtype=bool), _DETECTION, None), missed)
+        return Exact(None, _detections(part, np.empty(0, dtype=bool), np.empty(0), None), missed)
     part = part[part["probability"] > 0]
     weight = part["probability"].to_numpy(dtype=float)
     known = part["detection_s"].notna().to_numpy()
-    times = _detections(part, known, _DETECTION, given.horizon_s, weight, 1 / len(given.rows))
+    times = _detections(part, known, weight, given.horizon_s, 1 / int(given.rows["runs"].sum()))
     return Exact(weight[known].sum() / weight.sum(), times, missed)
 
 
@@ -241,7 +243,7 @@ _DISTANCE = "distance at detection, centre to centre: half were farther away; ne
 _PASSES = "of those, how many the declared driver, braking when it knew, stays clear of, [95 % interval]"
 
 _DETECTION_METRICS = (
-    Metric("n", _itself, lambda of: len(of.rows), 0, "rows: runs × measured objects × logs", "summary"),
+    Metric("n", _itself, lambda of: int(of.rows["runs"].sum()), 0, "rows: runs × measured objects × logs", "summary"),
     Metric("list_rate_hz", _itself, lambda of: of.list_rate_hz, 0, "fused lists per second", "summary"),
     Metric("detected_share", detected, lambda of: of.share, 1,
            "share of the rows that were detected, [95 % interval]", "summary", "share detected"),

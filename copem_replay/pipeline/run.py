@@ -16,7 +16,8 @@ from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.fixed import fixed_in
-from copem_replay.metrics.summary import horizon_s, summary
+from copem_replay.metrics.summary import horizon_s, own_sums_of, summary_of
+from copem_replay.metrics.tally import tally
 from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
 from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
 from copem_replay.pipeline.closed_form import check_exact, exact_table
@@ -37,6 +38,7 @@ class Result:
     """What one experiment gave."""
 
     table: pd.DataFrame  # detections.parquet
+    tally: pd.DataFrame  # tally.parquet
     summary: pd.DataFrame  # summary.csv
     notes: tuple[str, ...]  # what has to be said, one line each
     replays: tuple[Replay, ...]  # one per log
@@ -73,9 +75,10 @@ def run(
 def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables) -> Result:
     exact = _exactly(ready, experiment)
     table, parts, order = tables.of(ready, experiment)
-    horizon = horizon_s(table, experiment.measure.horizon_s)
-    rows, said = summary(
-        table,
+    tallied = tally(table)
+    horizon = horizon_s(tallied, experiment.measure.horizon_s)
+    rows, said = summary_of(
+        tallied,
         list(experiment.configurations),
         _rates(ready, experiment),
         seed=experiment.seed,
@@ -84,7 +87,9 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
         accuracy=totals(parts),
         fixed=fixed_in(experiment.as_written()),
         own=experiment.measure.metrics,
+        sums=own_sums_of(table, experiment.measure.metrics),
         outputs=output_times(recordings, experiment),
+        conflicts_asked=experiment.measure.conflict is not None,
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = notes_of(recordings, ready, experiment, replayed=True)
@@ -92,7 +97,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):
         accuracy = accuracy_tables(parts, order, same_instants=same_instants(ready))
-    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
+    return Result(table, tallied, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
 
 
 def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
@@ -111,8 +116,8 @@ def _at_point(
     if not point.same_units:
         ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
     table, parts, _ = tables.of(ready, experiment)
-    rows, _ = summary(
-        table,
+    rows, _ = summary_of(
+        tally(table),
         list(experiment.configurations),
         _rates(ready, experiment),
         seed=experiment.seed,
@@ -120,6 +125,7 @@ def _at_point(
         exact=_exactly(ready, experiment),
         accuracy=totals(parts),
         fixed=fixed_in(experiment.as_written()),
+        conflicts_asked=experiment.measure.conflict is not None,
     )
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)

@@ -89,7 +89,7 @@ def _files(
     experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
 ) -> list[str]:
     """What is going to be in the folder, by names relative to it."""
-    files = [EXPERIMENT, MARK, "detections.parquet", "summary.csv"]
+    files = [EXPERIMENT, MARK, "detections.parquet", "tally.parquet", "summary.csv"]
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
     if result.accuracy is not None:
         files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
@@ -113,6 +113,7 @@ def _fill(
     data["logs"] = _entries(experiment.logs, recordings, place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
+    write_parquet(result.tally, scratch / "tally.parquet")
     write_csv(result.summary, scratch / "summary.csv")
     if result.exact is not None:
         write_parquet(result.exact, scratch / "exact.parquet")

@@ -532,7 +532,7 @@ class TestFiles:
         first = written(tmp_path / "a")
         assert set(first) == {
             "detections.parquet", "exact.parquet", "experiment.yaml", "provenance.json", "summary.csv", "sweep.csv",
-            "accuracy.parquet", "bands.csv", "instants.parquet", "lists.parquet", "thresholds.parquet",
+            "accuracy.parquet", "bands.csv", "instants.parquet", "lists.parquet", "thresholds.parquet", "tally.parquet",
         }  # fmt: skip
         assert first == written(tmp_path / "b")
 

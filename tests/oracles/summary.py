@@ -1,0 +1,36 @@
+"""Figures of `summary.csv` straight from rows of `detections.parquet`, one by one: nothing is counted together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.metrics.survival import (
+    cumulative_incidence,
+    quantile_time,
+    quantile_with_never,
+    restricted_mean,
+)
+
+CODES = {"object_left": 2, "ego_left": 0, "log_end": 0}
+
+
+def figures(rows: pd.DataFrame, horizon_s: float, prefix: str = "") -> dict[str, float | None]:
+    """Of one configuration; `prefix`: `conflict_` for the second event."""
+    to, known = ("to_conflict" if prefix else "to"), rows[f"{prefix}detected"].to_numpy(dtype=bool)
+    time_s = rows[f"time_{to}_detection_s"].to_numpy(dtype=float)
+    looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
+    ending = np.where(known, 1, [CODES[reason] for reason in rows["ended_by"]])
+    incidence = cumulative_incidence(np.round(np.where(known, time_s, looked_s), 9), ending)
+    away_m = rows[f"distance_at_{prefix}detection_m"].to_numpy(dtype=float)
+    placed = ~known | ~np.isnan(away_m)
+    found = {
+        f"{prefix}detected_share": known.mean(),
+        f"{prefix}ttd_median_s": quantile_time(*incidence, 0.5),
+        f"{prefix}ttd_p95_s": quantile_time(*incidence, 0.95),
+        f"{prefix}ttd_rmst_s": restricted_mean(*incidence, horizon_s),
+    }
+    for name, q in (("dad_median_m", 0.5), ("dad_p5_m", 0.05)):
+        if placed.any() and (not prefix or q == 0.5):
+            found[prefix + name] = quantile_with_never(away_m[placed], known[placed], q)
+    return found
