@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,6 @@ class Result:
     """What one experiment gave."""
 
     table: pd.DataFrame  # detections.parquet
-    tally: pd.DataFrame  # tally.parquet
     summary: pd.DataFrame  # summary.csv
     notes: tuple[str, ...]  # what has to be said, one line each
     replays: tuple[Replay, ...]  # one per log
@@ -47,6 +46,7 @@ class Result:
     accuracy: AccuracyTables | None = None  # with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
     costs: tuple[str, ...] = ()  # what has to be said on the terminal alone: no two runs take the same time
+    tally: pd.DataFrame = field(default_factory=pd.DataFrame)  # tally.parquet
 
 
 def run(
@@ -97,7 +97,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):
         accuracy = accuracy_tables(parts, order, same_instants=same_instants(ready))
-    return Result(table, tallied, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep)
+    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep, tally=tallied)
 
 
 def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from copem_replay.metrics.accuracy import metrics as accuracy_figures
 from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.metrics import ACCURACY
 from copem_replay.metrics.accuracy.nees import expected
-from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, total
+from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, Total, for_runs, joined, total
 from copem_replay.metrics.gospa import gospa, ospa
 from copem_replay.metrics.matching import Matches, match, match_both
 from tests.helpers.at_once import assess
@@ -753,6 +754,31 @@ def test_blocks_of_many_runs_are_summed_as_the_whole_to_the_last_bit(cut: int) -
     whole = assessed(*runs, **given)
     blocks = [assessed(*runs[s : s + cut], **given) for s in range(0, len(runs), cut)]
     assert_equal_totals(total(blocks), total([whole]))
+
+
+def tree(values: list[float]) -> float:
+    """The sum of the leaves of a tree that is complete but for its right end: halves of the next power of two."""
+    if len(values) == 1:
+        return values[0]
+    half = 1 << (len(values) - 1).bit_length() - 1
+    return tree(values[:half]) + tree(values[half:])
+
+
+@pytest.mark.parametrize("runs", [1, 2, 3, 5, 8, 11, 13])
+@pytest.mark.parametrize("step", [1, 2, 4, 8])
+def test_runs_add_up_as_the_leaves_of_a_tree(runs: int, step: int) -> None:
+    """However they are grouped: sums of neighbouring runs are parts of the sum of all."""
+    rng = np.random.default_rng(runs)
+    off_m = [[rng.normal(0, 0.7, 2).tolist() for _ in range(2)] for _ in range(runs)]
+    given: dict[str, Any] = {"places": {CAR: standing(10, 10, 2)}, "episodes": {CAR: (0, 1)}}
+    of_runs = [assessed([entry(10 + x, 10 + y) for x, y in of_run], **given) for of_run in off_m]
+    expected = tree([float(one.by_object["square_m2"][0, 0]) for one in of_runs])
+    whole = total(of_runs)
+    assert whole.episodes["square_m2"] == expected
+    borders = [k for k in (0, *(1 << e for e in range(4))) if k <= step] + list(range(2 * step, runs, step))
+    borders = [k for k in borders if k < runs] + [runs]
+    pieces = [(b - a, total(of_runs[a:b])) for a, b in pairwise(borders)]
+    assert_equal_totals(joined(pieces), whole)
 
 
 @settings(max_examples=25)

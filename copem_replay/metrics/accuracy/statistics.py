@@ -195,27 +195,53 @@ class Total:
 
 
 def total(parts: Sequence[Accuracy]) -> Total:
-    """Sums over all runs, in their order, and episodes; blocks of runs add up to the same, to the last bit."""
+    """Sums over episodes and all runs, which are in the order of `parts`: to the last bit, however they are cut.
+
+    Runs add up pairwise, as the leaves of a tree: two neighbours, then two neighbouring pairs, … So what runs from a
+    power of two on sum up to, as many as that power or fewer, is a part of the sum of all: see `joined`.
+    """
 
     def all_runs(name: str) -> Any:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    episodes = np.concatenate([part.by_object.reshape(-1) for part in parts])
+    episodes = all_runs("by_object")
     return Total(
         parts[0].settings,
-        len(episodes),
+        episodes.size,
         int((episodes["pairs"] > 0).sum()),
         int((episodes["tracked"] > 0).sum()),
-        _summed(episodes),
+        _summed(_summed(episodes.T)),
         _summed(all_runs("by_run")),
         all_runs("ghosts_at").sum(axis=0),
         *(_summed(all_runs(name)) for name in ("by_distance", "by_time", "by_existence")),
     )
 
 
+def joined(parts: Sequence[tuple[int, Total]]) -> Total:
+    """The sum over all runs, of sums over neighbouring runs (how many, their sum), as `total` has it.
+
+    Each begins at a multiple of the power of two that its number of runs, the last one's aside, is.
+    """
+    nodes: list[tuple[int, Total]] = []
+    for node in parts:
+        nodes.append(node)
+        while len(nodes) > 1 and nodes[-1][0] == nodes[-2][0]:
+            (size, last), (_, before) = nodes.pop(), nodes.pop()
+            nodes.append((2 * size, before + last))
+    _, result = nodes.pop()
+    while nodes:  # what has no neighbour of its size goes up as it is
+        result = nodes.pop()[1] + result
+    return result
+
+
 def _summed(records: Records) -> Records:
-    """Sums over the first axis, field by field."""
+    """Pairwise sums over the first axis, field by field."""
     sums: Records = np.zeros(records.shape[1:], dtype=records.dtype)
-    for name in records.dtype.names or ():
-        sums[name] = records[name].sum(axis=0)
+    for name in records.dtype.names or () if len(records) else ():
+        values = records[name]
+        while len(values) > 1:
+            pairs = values[::2].copy()
+            pairs[: len(values) // 2] += values[1::2]
+            values = pairs
+        sums[name] = values[0]
     return sums
