@@ -109,13 +109,20 @@ class FusedTracks:
         place[order] = np.arange(len(order)) - np.repeat(bounds[:-1], np.diff(bounds))
         return place
 
-    def name_of(self, scene: Scene, row: int) -> str:
-        """The id of the object a row is about, else the fusion's own identity for it, else its place in its list."""
-        object_ix = int(self.fused.row_object_ix[row])
-        if object_ix >= 0:
-            return scene.object_ids[object_ix]
-        track_id = -1 if self.said is None else int(self.said["track_id"][row])
-        return f"track:{track_id}" if track_id >= 0 else f"entry:{self._place[row]}"
+    def names_of(self, scene: Scene) -> tuple[list[str], Int]:
+        """Names, and (P,) which of them each row goes by.
+
+        The id of the object a row is about, else the fusion's own identity for it, else its place in its list.
+        """
+        which = self.fused.row_object_ix.copy()
+        unknown = np.flatnonzero(which < 0)
+        track_id = np.full(len(unknown), -1) if self.said is None else self.said["track_id"][unknown]
+        tracks, track = np.unique(track_id[track_id >= 0], return_inverse=True)
+        which[unknown] = len(scene.object_ids) + len(tracks) + self._place[unknown]
+        which[unknown[track_id >= 0]] = len(scene.object_ids) + track
+        longest = int(np.diff(self.fused.by_frame[1]).max(initial=0))
+        names = (*scene.object_ids, *(f"track:{t}" for t in tracks), *(f"entry:{k}" for k in range(longest)))
+        return list(names), which
 
     def class_of(self, scene: Scene) -> Int:
         """(P,) index into CLASSES: the true one, or what the fusion takes it for."""
@@ -125,11 +132,17 @@ class FusedTracks:
         classes: Int = scene.object_class[self.fused.row_object_ix].astype(np.int64)
         return classes
 
+    @cached_property
+    def listed_rows(self) -> tuple[Int, Int]:
+        """Rows of `fused` in the first run's lists, list by list, and where each list begins, (F + 1,)."""
+        order, bounds = self.fused.by_frame
+        there = self.fused.valid[0, order]
+        return order[there], np.concatenate([[0], np.cumsum(there)])[bounds]
+
     def listed(self, frame: int) -> list[int]:
         """Rows of `fused` that are in one list."""
-        order, bounds = self.fused.by_frame
-        rows = order[bounds[frame] : bounds[frame + 1]]
-        result: list[int] = rows[self.fused.valid[0, rows]].tolist()
+        rows, bounds = self.listed_rows
+        result: list[int] = rows[bounds[frame] : bounds[frame + 1]].tolist()
         return result
 
 

@@ -29,13 +29,14 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.io.recorded_osi import read_lists
 from copem_replay.io.recording import read
-from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write import osi_sensor_data as sensor_data
+from copem_replay.io.write.detail_json_writer import DetailWriter
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, atomic_mcap, write_mcap
 from copem_replay.io.write.message_family import family_of
 from copem_replay.pipeline.blocks import replay_block
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
+from tests.oracles import messages as plain
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "logs/tc016d.mcap"
@@ -254,8 +255,9 @@ def test_a_list_of_nothing_was_captured_never(written: Written) -> None:
     fused_tracks = written.run_tracks["PEM"]
     never = np.full(len(fused_tracks.fused.stamp_ns), NO_CAPTURE_NS)
     silent = replace(fused_tracks.fused, stamp_ns=never, valid=np.zeros_like(fused_tracks.fused.valid))
-    writer = detail.DetailWriter(written.replay.scene, replace(fused_tracks, fused=silent), {})
-    assert json.loads(writer.message(0, 7)) == {"available_ns": 7, "captured_ns": None, "objects": [], "events": []}
+    writer = DetailWriter(written.replay.scene, replace(fused_tracks, fused=silent), {})
+    content = json.loads(next(writer.messages(np.full(len(never), 7))))
+    assert content == {"available_ns": 7, "captured_ns": None, "objects": [], "events": []}
 
 
 def test_read_back_as_a_log_it_is_the_input(written: Written) -> None:
@@ -356,9 +358,10 @@ def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path)
     scene = written.replay.scene
     for name, fused_tracks in written.run_tracks.items():
         numbers = {v: int(k[5:]) for k, v in metadata(path)[RUN_RECORD].items() if k.startswith("unit.")}
-        plain = sensor_data.SensorDataWriter(scene, fused_tracks, numbers)
         lists = [(m[1], m[4]) for m in messages(path) if m[0] == f"copem/{name}/objects"]
-        assert lists == [(at, plain.message(frame, at)) for frame, (at, _) in enumerate(lists)]
+        assert lists == [
+            (at, plain.sensor_data(scene, fused_tracks, numbers, frame, at)) for frame, (at, _) in enumerate(lists)
+        ]
 
 
 def test_what_counts_the_messages_is_dropped(written: Written, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES
+from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Scene
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems, read_logs
@@ -224,6 +224,11 @@ def decoded(path: Path, topic: str | None = None) -> Iterator[tuple[int, bytes, 
             yield message.log_time, message.data, found
 
 
+def name_of(fused_tracks: FusedTracks, scene: Scene, row: int) -> str:
+    names, which = fused_tracks.names_of(scene)
+    return names[which[row]]
+
+
 def stamp_of(time: Any) -> int:
     return int(time.sec * 10**9 + time.nanosec)
 
@@ -268,7 +273,7 @@ def test_every_column_comes_back(written: Written, configuration: str) -> None:
         assert len(message.objects) == len(detail["objects"]) == len(rows)
         for item, beside, p in zip(message.objects, detail["objects"], rows, strict=True):
             seen += 1
-            assert beside["id"] == fused_tracks.name_of(scene, p)
+            assert beside["id"] == name_of(fused_tracks, scene, p)
             pose, twist = item.kinematics.pose_with_covariance, item.kinematics.twist_with_covariance
             at, turn, size = pose.pose.position, pose.pose.orientation, item.shape.dimensions
             assert (at.x, at.y, at.z) == (fused.x_m[0, p], fused.y_m[0, p], fused.z_m[0, p])
@@ -317,7 +322,7 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
     for frame, (log_ns, _, update) in enumerate(updates):
         assert [(d.type, stamp_of(d.timestamp), d.id) for d in update.deletions] == [(1, log_ns, "")]
         rows = fused_tracks.listed(frame)
-        assert [e.id for e in update.entities] == [fused_tracks.name_of(scene, p) for p in rows]
+        assert [e.id for e in update.entities] == [name_of(fused_tracks, scene, p) for p in rows]
         for entity, p in zip(update.entities, rows, strict=True):
             assert (entity.frame_id, stamp_of(entity.timestamp), stamp_of(entity.lifetime)) == ("map", log_ns, 0)
             assert {m.key: m.value for m in entity.metadata} == {

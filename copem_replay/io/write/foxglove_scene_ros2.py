@@ -30,8 +30,8 @@ class SceneWriter:
 
     def __init__(self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str) -> None:
         self._fused, self._listed = fused_tracks.fused, fused_tracks.listed
-        names = [fused_tracks.name_of(scene, row) for row in range(len(fused_tracks.fused.frame_ix))]
-        kinds = fused_tracks.class_of(scene).tolist()
+        every, which = fused_tracks.names_of(scene)
+        names, kinds = [every[k] for k in which.tolist()], fused_tracks.class_of(scene).tolist()
         made = {
             key: _entity(key[0], metadata(*key, configuration), frame_id)
             for key in dict.fromkeys(zip(names, kinds, strict=True))

@@ -158,10 +158,11 @@ def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
 
 
 def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
-    for frame, available_s in enumerate(fused.arrives_s[0].tolist()):
-        available_ns = scene.t0_ns + round(available_s * 1e9)
-        for channel, writer in writers.items():
-            yield Message(channel, available_ns, writer.message(frame, available_ns), available_ns, 0)
+    available_ns = scene.t0_ns + np.rint(fused.arrives_s[0] * 1e9).astype(np.int64)
+    streams = zip(*(writer.messages(available_ns) for writer in writers.values()), strict=True)
+    for time_ns, beside in zip(available_ns.tolist(), streams, strict=True):
+        for channel, data in zip(writers, beside, strict=True):
+            yield Message(channel, time_ns, data, time_ns, 0)
 
 
 def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]:

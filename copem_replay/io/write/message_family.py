@@ -7,8 +7,7 @@ only, for a file of the profile `ros2` holds nothing else.
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -16,7 +15,7 @@ from typing import Any, Protocol
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import TRUTH, Scene
+from copem_replay.core.tracks import TRUTH, Int, Scene
 from copem_replay.io.recording import Recording
 from copem_replay.io.write import (
     autoware_objects as detected_objects,
@@ -36,13 +35,15 @@ from copem_replay.io.write import (
 from copem_replay.io.write import (
     osi_sensor_data as sensor_data,
 )
+from copem_replay.io.write.detail_json_writer import DetailWriter
 from copem_replay.io.write.drawing import Entity, Pose
+from copem_replay.io.write.osi_sensor_data_writer import SensorDataWriter
 from copem_replay.io.write.pass_through import Catalogue
 from copem_replay.io.write.ros2_definitions import STATUS, STRING, TRANSFORM, definition
 from copem_replay.io.write.status import JSON_SCHEMA as STATUS_JSON
 from copem_replay.io.write.status import SCHEMA as STATUS_SCHEMA
-from copem_replay.io.write.status import Statuses, StatusWriter
-from copem_replay.io.write.uncertainty import UncertaintyWriter
+from copem_replay.io.write.status import STATUSES, Statuses, StatusWriter
+from copem_replay.io.write.uncertainty import Ellipses, UncertaintyWriter
 
 OSI_CHANNEL = "net.asam.osi.trace.channel."
 _NAMELESS = "map"  # chosen: what the world is called where nobody says it, as REP 105 has it
@@ -58,8 +59,8 @@ QOS = (
 class ListWriter(Protocol):
     """Turns the fused lists of one configuration into messages of one channel."""
 
-    def message(self, frame: int, available_ns: int) -> bytes:
-        """List number `frame` as it became available at `available_ns` of the log's clock."""
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        """The lists as they became available at these instants of the log's clock, (F,)."""
 
 
 class Opened(Protocol):
@@ -159,13 +160,13 @@ class _OpenedOsi:
         objects, scenes, details = topics_of(name)
         channel, scene = self._catalogue.channel, self._scene
         return {
-            channel(objects, "protobuf", self._objects, description): sensor_data.SensorDataWriter(
+            channel(objects, "protobuf", self._objects, description): SensorDataWriter(
                 scene, fused_tracks, self._units
             ),
             channel(scenes, "protobuf", self._scenes, {}): foxglove.SceneWriter(
                 scene, fused_tracks, name, colour, self._frame_id
             ),
-            channel(details, "json", self._details, {}): detail.DetailWriter(scene, fused_tracks, events),
+            channel(details, "json", self._details, {}): DetailWriter(scene, fused_tracks, events),
         }
 
     def seen_besides(
@@ -176,7 +177,7 @@ class _OpenedOsi:
         return {
             catalogue.channel(status, "json", said, {}): StatusWriter(statuses),
             catalogue.channel(uncertainty, "protobuf", self._scenes, {}): UncertaintyWriter(
-                self._scene, fused_tracks, colour, self.drawn
+                self._scene, fused_tracks, colour, partial(foxglove.ellipses, frame_id=self._frame_id)
             ),
         }
 
@@ -219,10 +220,10 @@ class _OpenedRos2:
     ) -> dict[int, ListWriter]:
         scene, frame_id = self._scene, self._frame_id
         objects = detected_objects.DetectedObjectsWriter(scene, fused_tracks, frame_id)
-        details = detail.DetailWriter(scene, fused_tracks, events, sizes_of=objects.round)
+        details = DetailWriter(scene, fused_tracks, events, sizes_of=objects.round)
         writers: list[ListWriter] = [
-            objects,
-            foxglove_ros2.SceneWriter(scene, fused_tracks, name, colour, frame_id),
+            _ListByList(objects.message),
+            _ListByList(foxglove_ros2.SceneWriter(scene, fused_tracks, name, colour, frame_id).message),
             _AsString(details),
         ]
         numbers = [
@@ -236,8 +237,9 @@ class _OpenedRos2:
     ) -> dict[int, ListWriter]:
         schemas = self._catalogue.schema(STATUS, "ros2msg", definition(STATUS)), self._schemas[1]
         numbers = [self._channel(topic, schema) for topic, schema in zip(more_topics_of(name), schemas, strict=True)]
-        uncertainty = UncertaintyWriter(self._scene, fused_tracks, colour, self.drawn)
-        return dict(zip(numbers, (_AsStatus(statuses), uncertainty), strict=True))
+        uncertainty = UncertaintyWriter(self._scene, fused_tracks, colour, self._ellipses)
+        writers: list[ListWriter] = [_AsStatus(statuses), uncertainty]
+        return dict(zip(numbers, writers, strict=True))
 
     def truth(self) -> TruthWriter:
         moves = self._catalogue.schema(TRANSFORM, "ros2msg", definition(TRANSFORM))
@@ -249,6 +251,11 @@ class _OpenedRos2:
     def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
         return foxglove_ros2.drawn(entities, time_ns, self._frame_id)
 
+    def _ellipses(self, ellipses: Ellipses, time_ns: Int, start: Int) -> Iterator[bytes]:
+        every = ellipses.entities()
+        for k, at_ns in enumerate(time_ns.tolist()):
+            yield self.drawn(every[start[k] : start[k + 1]], at_ns)
+
     def _channel(self, topic: str, schema: int) -> int:
         return self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
 
@@ -259,16 +266,17 @@ class _AsStatus:
     def __init__(self, statuses: Statuses) -> None:
         self._statuses = statuses
 
-    def message(self, frame: int, available_ns: int) -> bytes:
-        out = cdr_write.Cdr()
-        out.stamp(available_ns)
-        found = list(self._statuses.at(frame, available_ns))
-        out.add("I", len(found))
-        for name, status, age_s in found:
-            out.text(name)
-            out.text(status)
-            out.add("d", math.nan if age_s is None else age_s)
-        return out.message()
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        status, age_s = self._statuses.at(available_ns)
+        for time_ns, each, ages in zip(available_ns.tolist(), status.tolist(), age_s.tolist(), strict=True):
+            out = cdr_write.Cdr()
+            out.stamp(time_ns)
+            out.add("I", len(each))
+            for name, which, age in zip(self._statuses.names, each, ages, strict=True):
+                out.text(name)
+                out.text(STATUSES[which])
+                out.add("d", age)
+            yield out.message()
 
 
 class _AsString:
@@ -277,8 +285,18 @@ class _AsString:
     def __init__(self, writer: ListWriter) -> None:
         self._writer = writer
 
-    def message(self, frame: int, available_ns: int) -> bytes:
-        return cdr_write.string_message(self._writer.message(frame, available_ns).decode())
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        return (cdr_write.string_message(data.decode()) for data in self._writer.messages(available_ns))
+
+
+class _ListByList:
+    """What makes one message at a time, of the number of its list and the instant."""
+
+    def __init__(self, message: Callable[[int, int], bytes]) -> None:
+        self._message = message
+
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        return (self._message(frame, time_ns) for frame, time_ns in enumerate(available_ns.tolist()))
 
 
 def _protobuf(catalogue: Catalogue, message_class: Any, name: str) -> int:
