@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from copem_replay.core.draws import Draws
 from copem_replay.core.lasting import renewal_stamps
 from copem_replay.core.random import RandomKey
 from copem_replay.core.tracks import CLASSES, Float, Int
-from copem_replay.perception.draws import Draws
 from copem_replay.perception.observation import Observations, rows_by_unit
 from copem_replay.perception.pem.scores import Claimed, Scores
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from copem_replay.core.draws import Draws
 from copem_replay.core.followed import followed_by
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.lasting import ListTimes, births, shared
 from copem_replay.core.random import CounterRng, RandomKey, Words, object_words, stable_hash
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.perception.draws import Draws
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.pem.classes import drawn_class, row_of
 from copem_replay.perception.pem.condition import applies

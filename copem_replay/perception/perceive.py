@@ -12,15 +12,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from copem_replay.core.draws import Draws
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.lasting import ListTimes
+from copem_replay.core.memory import Part, Parts
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.config import PerceptionSetup
-from copem_replay.perception.draws import Draws
 from copem_replay.perception.observation import Observations, rows_by_unit
 from copem_replay.perception.pem.error import errors_of
-from copem_replay.perception.pem.memory import Part, Parts, quantity_of
+from copem_replay.perception.pem.memory import quantity_of
 from copem_replay.perception.pose_error import misplaced
 
 SMALLEST_SIZE_M = 0.05

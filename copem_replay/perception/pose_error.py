@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from copem_replay.core.draws import Draws
 from copem_replay.core.interpolation import wrap
 from copem_replay.core.lasting import ListTimes, shared
 from copem_replay.core.random import CounterRng, RandomKey
 from copem_replay.core.tracks import Float, Int, Scene, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.perception.draws import Draws
 
 if TYPE_CHECKING:
     from copem_replay.perception.config import PerceptionSetup

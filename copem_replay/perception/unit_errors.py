@@ -10,7 +10,7 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from copem_replay.core.components import Flag, Frozen, NotNegative
-from copem_replay.perception.pem.memory import Part, Parts
+from copem_replay.core.memory import Part, Parts
 
 
 class PoseError(Frozen):

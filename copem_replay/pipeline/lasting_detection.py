@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from copem_replay.core.errors import ExperimentError
+from copem_replay.core.memory import Part
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Float, Int, Tracks
 from copem_replay.metrics.lasting_survival import Lasting
 from copem_replay.perception.observation import rows_by_unit
-from copem_replay.perception.pem.memory import Part
 from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.prepare import Replay

@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from copem_replay.core.memory import Memory
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.experiment.sweep_keys import SweptBy
 from copem_replay.fusion.base import ListFusion
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers
-from copem_replay.perception.pem.memory import Memory
 from copem_replay.perception.pem.model import Pem
 
 KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s", "ghosts_in_list")

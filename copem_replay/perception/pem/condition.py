@@ -8,11 +8,12 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from copem_replay.core.components import Frozen, NotNegative, Number, Share, Slot
+from copem_replay.core.memory import Memory
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.pem.detection import DETECTION_MODELS, DetectionModel
 from copem_replay.perception.pem.error import ERROR_MODELS, ErrorModel, names_asked
-from copem_replay.perception.pem.memory import QUANTITIES, Memory, check_names, quantity_of
+from copem_replay.perception.pem.memory import QUANTITIES, check_names, quantity_of
 from copem_replay.perception.pem.scores import Claimed
 
 _ON_THE_BOUND = 1e-9

@@ -12,10 +12,11 @@ from pydantic import Field, GetJsonSchemaHandler, SerializerFunctionWrapHandler,
 from pydantic_core import CoreSchema
 
 from copem_replay.core.components import Frozen
+from copem_replay.core.memory import Memory, Parts
 from copem_replay.perception.pem.classes import Classes
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.pem.ghosts import Ghosts
-from copem_replay.perception.pem.memory import QUANTITIES, Memory, Parts, check_names
+from copem_replay.perception.pem.memory import QUANTITIES, check_names
 from copem_replay.perception.pem.scores import Scores
 from copem_replay.perception.pem.track_ids import TrackIds
 

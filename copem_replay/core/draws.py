@@ -15,9 +15,9 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from copem_replay.core.lasting import ListTimes, always, drifting, held, shared
+from copem_replay.core.memory import Part, numbered
 from copem_replay.core.random import CounterRng, RandomKey
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.perception.pem.memory import Part, numbered
 
 _WHOLE = 1 - 1e-9
 """Shares that sum to this leave no rest."""
