@@ -43,7 +43,7 @@ class FusionSchedule:
 
 def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
     """The receiver's instants for lists whose arrival times are common to all runs."""
-    arrives_s = heard.arrives_s[0]
+    arrives_s = heard.common_arrives_s
     arrived = np.flatnonzero(np.isfinite(arrives_s))
     arrived = arrived[np.argsort(arrives_s[arrived], kind="stable")]
     ordered = arrives_s[arrived]
@@ -64,7 +64,7 @@ def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
 
 def out_of_sequence(heard: Tracks) -> Bool:
     """(F,) lists that arrive when a newer one of their unit is there already, or not at all."""
-    arrives_s = heard.arrives_s[0]
+    arrives_s = heard.common_arrives_s
     result: Bool = ~np.isfinite(arrives_s)
     for unit in np.unique(heard.frame_unit_ix):
         mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(arrives_s))

@@ -105,8 +105,8 @@ def transmit(seen: Tracks, link: LinkModel, where: str, heard: Container[str] | 
     `heard`: names of the units whose lists reach the receiver, None: all. Raises InputError, naming `where` the link
     stands, where a link of the user's own fails.
     """
-    made = np.isfinite(seen.arrives_s[0])  # a list that is not made is no concern of the link
-    sent_s = np.where(made, seen.arrives_s[0], seen.captured_s)
+    made = np.isfinite(seen.common_arrives_s)  # a list that is not made is no concern of the link
+    sent_s = np.where(made, seen.common_arrives_s, seen.captured_s)
     sent = SentLists(seen.units, seen.frame_unit_ix, seen.captured_s, sent_s)
     delay_s = asked(link, where, lambda: Delays(link.delays_s(sent), len(sent.sent_s)).common_s)
     if heard is not None:

@@ -57,7 +57,7 @@ class FusedTracks:
         ids = np.array([*self.scene.object_ids, None], dtype=object)  # −1 is the last
         said = self.said
         columns: dict[str, object] = {
-            "available_s": self.fused.arrives_s[0, self.fused.frame_ix[rows]],
+            "available_s": self.fused.common_arrives_s[self.fused.frame_ix[rows]],
             "captured_s": self.captured_s[0, rows],
             "object_id": ids[self.fused.row_object_ix[rows]],
             "track_id": np.full(len(rows), -1) if said is None else said["track_id"][rows],
@@ -97,7 +97,7 @@ class FusedTracks:
         if self.said is not None:
             return np.asarray(self.said["unit_ix"], dtype=np.int64)[None]
         first = np.full(self.fused.valid.shape, -1)
-        arrives_s = self.heard.arrives_s[0, self.heard.frame_ix]
+        arrives_s = self.heard.common_arrives_s[self.heard.frame_ix]
         _first_unit(self.heard.valid, arrives_s, self.heard.row_unit_ix, self.entries, self.start, first)
         return first
 

@@ -156,6 +156,19 @@ class Tracks:
         if len(runs) > 2:
             raise ValueError(f"Tracks: values disagree on the number of runs: {sorted(runs)}")
 
+    @property
+    def common_arrives_s(self) -> Float:
+        """(F,) when each list arrives, in the one run there is, or in all alike. Raises ValueError where runs differ.
+
+        Whatever goes by it is asked for one run at a time.
+        """
+        if len(self.arrives_s) != 1:
+            raise ValueError(
+                f"Tracks.arrives_s: expected arrivals that all runs share, found {len(self.arrives_s)} rows"
+            )
+        arrives_s: Float = self.arrives_s[0]
+        return arrives_s
+
     @cached_property
     def track_ix(self) -> Int:
         """(P,) the track of each row."""

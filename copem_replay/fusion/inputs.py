@@ -67,7 +67,7 @@ def inputs(
     at = at or fusion_schedule(heard, max_age_s=max_age_s)
     captured_s = heard.captured_s if captured_s is None else captured_s
     return Inputs(
-        heard.units, heard.frame_unit_ix, captured_s, heard.arrives_s[0], lists,
+        heard.units, heard.frame_unit_ix, captured_s, heard.common_arrives_s, lists,
         at.issue_s, at.newest, at.arrived, at.arrived_start,
     )  # fmt: skip
 

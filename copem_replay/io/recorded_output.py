@@ -30,7 +30,7 @@ def recorded_output(
     Raises RecordingError as `recorded_unit`.
     """
     found, notes = recorded_unit(recording, name, asked, gate_m=gate_m, max_gap_s=max_gap_s)
-    stamp_ns = recording.scene.t0_ns + np.rint(found.tracks.arrives_s[0] * 1e9).astype(np.int64)
+    stamp_ns = recording.scene.t0_ns + np.rint(found.tracks.common_arrives_s * 1e9).astype(np.int64)
     behind_ns = found.logged_ns - stamp_ns
     asks = ~found.capture_said & found.stamped
     away_s = float(np.median(behind_ns[asks])) * 1e-9 if asks.any() else 0.0

@@ -88,7 +88,7 @@ def recorded_unit(
         for column, value in (("cov_ee_m2", ee), ("cov_en_m2", en), ("cov_nn_m2", nn)):
             columns[column] = np.where(unsaid, value, getattr(tracks, column))
     late_ns = np.where(found.capture_said, 0, round(asked.delay_s * 1e9))
-    arrives_ns = scene.t0_ns + np.rint(tracks.arrives_s[0] * 1e9).astype(np.int64)
+    arrives_ns = scene.t0_ns + np.rint(tracks.common_arrives_s * 1e9).astype(np.int64)
     stamp_ns = np.minimum(tracks.stamp_ns - late_ns, arrives_ns)
     early = int((tracks.stamp_ns > arrives_ns + SAME_INSTANT_NS).sum())
     if early:

@@ -85,7 +85,7 @@ class Reach:
             self._oldest.append((at.issue_s, np.minimum(oldest_s, used_s.min(axis=1))))
             fusion = configuration.fusion
             if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
-                arrives_s, captured_s = mine.arrives_s[0, at.arrived], mine.captured_s[at.arrived]
+                arrives_s, captured_s = mine.common_arrives_s[at.arrived], mine.captured_s[at.arrived]
                 ahead_s = 0.0
                 if stated is not None and (told := stated[name]) is not None:  # it looks back by what it is told
                     captured_s, ahead_s = told.stated_s[at.arrived], told.ahead_s

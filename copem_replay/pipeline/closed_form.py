@@ -102,7 +102,7 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
     )
     instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
     lasts = None if instants is not None else lasting(replay, units, name, heard)
-    arrives_s = heard.arrives_s[0, heard.frame_ix]
+    arrives_s = heard.common_arrives_s[heard.frame_ix]
     by_object = np.argsort(heard.row_object_ix, kind="stable")
     first, last = (
         np.searchsorted(heard.row_object_ix[by_object], episodes.object_ix, side) for side in ("left", "right")
@@ -126,7 +126,7 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
 
 def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
     """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
-    came = np.isfinite(heard.arrives_s[0])
+    came = np.isfinite(heard.common_arrives_s)
     if heard.units != (TRUTH,) and (replay.expanded.share[heard.frame_unit_ix[came]] < 1).any():
         raise ExperimentError(
             f"{replay.scene.log}: exact: configuration {name}: some units are only in some runs, and "
@@ -143,7 +143,7 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
     for instant in everyone:
-        arrivals = heard.arrives_s[0, came & (instants == instant)]
+        arrivals = heard.common_arrives_s[came & (instants == instant)]
         if np.ptp(arrivals) > _TOLERANCE_S:
             raise ExperimentError(
                 f"{replay.scene.log}: exact: configuration {name}: lists captured together arrive up to "

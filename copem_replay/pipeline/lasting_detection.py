@@ -102,8 +102,8 @@ def _number(count: int) -> str:
 def _check_order(replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks, units: list[str]) -> None:
     """Raise ExperimentError unless lists that go by one number arrive in the order of their captures."""
     ixs = [list(experiment.units).index(unit) for unit in units]
-    frames = np.flatnonzero(np.isin(heard.frame_unit_ix, ixs) & np.isfinite(heard.arrives_s[0]))
-    arrives_s: Float = heard.arrives_s[0, frames[np.argsort(heard.captured_s[frames], kind="stable")]]
+    frames = np.flatnonzero(np.isin(heard.frame_unit_ix, ixs) & np.isfinite(heard.common_arrives_s))
+    arrives_s: Float = heard.common_arrives_s[frames[np.argsort(heard.captured_s[frames], kind="stable")]]
     late: Int = np.flatnonzero(arrives_s < np.maximum.accumulate(arrives_s) - _TOLERANCE_S)
     if len(late):
         who = f"unit {units[0]}" if len(units) == 1 else f"the {counted(len(units), 'unit')} {', '.join(units)}"

@@ -24,7 +24,7 @@ def output_times(recordings: Sequence[Recording], experiment: Experiment) -> dic
 
 def _of_log(recording: Recording, experiment: Experiment, name: str) -> OutputTimes:
     found = recording.lists[output_unit(name)]
-    available_s, captured_s = found.tracks.arrives_s[0], found.tracks.captured_s
+    available_s, captured_s = found.tracks.common_arrives_s, found.tracks.captured_s
     while_it_lasts = (available_s >= -_TOLERANCE_S) & (available_s <= recording.scene.end_s + _TOLERANCE_S)
     delay_s = np.where(found.capture_said, 0.0, experiment.outputs[name].delay_s)[while_it_lasts]
     says = (found.capture_said | found.stamped)[while_it_lasts]
@@ -45,9 +45,9 @@ def _newest_input_s(recording: Recording, experiment: Experiment, name: str, at_
         if unit not in recording.lists:  # its log lacks it
             continue
         lists = recording.lists[unit].tracks
-        order = np.argsort(lists.arrives_s[0], kind="stable")
+        order = np.argsort(lists.common_arrives_s, kind="stable")
         so_far_s = np.append(-np.inf, np.maximum.accumulate(lists.captured_s[order]))
-        arrived = np.searchsorted(lists.arrives_s[0, order], at_s + _TOLERANCE_S, side="right")
+        arrived = np.searchsorted(lists.common_arrives_s[order], at_s + _TOLERANCE_S, side="right")
         newest_s = np.maximum(newest_s, so_far_s[arrived])
     return newest_s
 

@@ -238,7 +238,7 @@ def _faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFa
         return None
     first = len(world.found.tracks.frame_ix)
     rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
-    return UnitFaults(rows, np.isinf(seen.arrives_s[0]))
+    return UnitFaults(rows, np.isinf(seen.common_arrives_s))
 
 
 def _without_truth(world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None = None) -> ObjectLists:

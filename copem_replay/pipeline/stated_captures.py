@@ -68,5 +68,5 @@ def stated_captures(scene: Scene, heard: Tracks, experiment: ExpandedExperiment,
     error_s = clock_errors_s(scene, heard.units, experiment, heard.captured_s, heard.frame_unit_ix, run)
     if error_s is None:
         return None
-    arrives_s = heard.arrives_s[0]
+    arrives_s = heard.common_arrives_s
     return StatedCaptures(np.minimum(heard.captured_s + error_s, arrives_s), heard.captured_s, arrives_s)

@@ -151,7 +151,7 @@ def fused_boxes(out: Out, path: list[str], scene: Scene, fused_tracks: FusedTrac
     shades = np.array([_rgba((*colour, alpha)) for alpha in ALPHAS], dtype=np.uint32)
 
     def more(rows: Int) -> dict[str, Any]:
-        age_of_information_s = tracks.arrives_s[0, tracks.frame_ix[rows]] - captured_s[rows]
+        age_of_information_s = tracks.common_arrives_s[tracks.frame_ix[rows]] - captured_s[rows]
         step = np.clip(np.rint(age_of_information_s / STEP_S), 0, len(ALPHAS) - 1).astype(np.int64)
         return {"class_ids": kind[rows], "colors": shades[step]}
 

@@ -60,7 +60,7 @@ def position_errors(
 def position_error(replay: Replay, experiment: Experiment, object_ix: int, fused: Tracks) -> tuple[Int, Float]:
     """When lists hold an object while it is there, ascending, and the distance from its true position then."""
     rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
-    time_s = fused.arrives_s[0, fused.frame_ix[rows]]
+    time_s = fused.common_arrives_s[fused.frame_ix[rows]]
     at, there = states_at(
         replay.truth, fused.row_object_ix[rows], time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
     )
@@ -116,7 +116,7 @@ def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) 
     ghosts = replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)] & (fused.row_object_ix < 0)
     if measure.annotated is not None:
         ghosts &= _annotated(replay, fused, settings)
-    near_s, gap_s = fused.arrives_s[0], experiment.max_gap_s + AROUND_S
+    near_s, gap_s = fused.common_arrives_s, experiment.max_gap_s + AROUND_S
     near = replay.truth if not len(near_s) else replay.truth.captured_between(near_s[0] - gap_s, near_s[-1] + gap_s)
     truth = near.take_tracks(measured[near.object_ix])
     rows, listed = by_frame(fused, fused.valid[0] & (measured[fused.row_object_ix] | ghosts))
@@ -137,7 +137,7 @@ def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) 
 
 def _annotated(replay: Replay, fused: Tracks, settings: Settings) -> Bool:
     """(P,) which entries of one run are where the truth is annotated."""
-    near = replay.truth_cache.reference(fused.arrives_s[0])
+    near = replay.truth_cache.reference(fused.common_arrives_s)
     f = fused.frame_ix
     return in_areas(
         fused.x_m[0], fused.y_m[0], near.x_m[f], near.y_m[f], corners(settings.annotated_m), settings.annotated_range_m

@@ -56,7 +56,7 @@ def _who_knows(
 
     scene = replay.scene
     # A box moves with the frames of the truth, what is known changes with the lists of either.
-    instants = np.unique(np.concatenate([ns(tracks.arrives_s[0]) for tracks in (replay.truth, first, second)]))
+    instants = np.unique(np.concatenate([ns(tracks.common_arrives_s) for tracks in (replay.truth, first, second)]))
     mine, other = (_held(tracks, instants, len(scene.object_ids)) for tracks in (first, second))
     ids = pa.array(scene.object_ids, pa.string())
     for part, only, size, words in (
@@ -83,7 +83,7 @@ def _held(tracks: Tracks, instants: Int, objects: int) -> Bool:
     rows = np.flatnonzero(tracks.valid[0] & (tracks.row_object_ix >= 0))
     held = np.zeros((len(tracks.stamp_ns) + 1, objects), dtype=bool)  # one more: −1, there is no list yet
     held[tracks.frame_ix[rows], tracks.row_object_ix[rows]] = True
-    newest = np.searchsorted(ns(tracks.arrives_s[0]), instants + SAME_INSTANT_NS, side="right") - 1
+    newest = np.searchsorted(ns(tracks.common_arrives_s), instants + SAME_INSTANT_NS, side="right") - 1
     there: Bool = held[newest]
     return there
 

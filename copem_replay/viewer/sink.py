@@ -154,7 +154,7 @@ def ns(time_s: Any) -> Any:
 
 def elapsed_ns(tracks: Tracks) -> Int:
     """(F,) when each list is available, since the log's start."""
-    elapsed: Int = ns(tracks.arrives_s[0])
+    elapsed: Int = ns(tracks.common_arrives_s)
     return elapsed
 
 

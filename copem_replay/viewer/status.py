@@ -137,7 +137,7 @@ def _lists(heard: Tracks, unit: int, object_ix: int) -> tuple[Int, Float, Int]:
     rows = np.flatnonzero((heard.row_object_ix == object_ix) & (heard.row_unit_ix == unit) & heard.valid[0])
     frames = np.unique(heard.frame_ix[rows])
     frames = frames[np.argsort(heard.captured_s[frames], kind="stable")]
-    arrives_s = heard.arrives_s[0, frames]
+    arrives_s = heard.common_arrives_s[frames]
     arrives_ns = np.where(np.isfinite(arrives_s), np.rint(arrives_s * 1e9), np.inf)
     every = np.sort(ns(heard.captured_s[heard.frame_unit_ix == unit]))
     return ns(heard.captured_s[frames]), arrives_ns, every

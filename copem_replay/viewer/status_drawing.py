@@ -121,6 +121,6 @@ def _of_first_units(heard: Tracks, rows: Int, column: Int, seen: Sight, first_un
         if not len(mine):
             continue
         named = first_unit.get(k)
-        soonest = mine[np.argmin(heard.arrives_s[0, heard.frame_ix[rows[mine]]])]
+        soonest = mine[np.argmin(heard.common_arrives_s[heard.frame_ix[rows[mine]]])]
         kept[mine] = unit[mine] == (heard.units.index(named) if named in heard.units else unit[soonest])
     return kept

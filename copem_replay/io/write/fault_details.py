@@ -22,12 +22,12 @@ def faults_by_list(fused_tracks: FusedTracks) -> list[dict[str, Any]]:
     faults, heard = fused_tracks.faults, fused_tracks.heard
     if faults is None:
         return []
-    issue_s = fused_tracks.fused.arrives_s[0]
+    issue_s = fused_tracks.fused.common_arrives_s
     told: list[dict[str, Any]] = [{"ghosts": [], "down": []} for _ in issue_s]
-    arrives_s = heard.arrives_s[0, heard.frame_ix[faults.ghosts]]
+    arrives_s = heard.common_arrives_s[heard.frame_ix[faults.ghosts]]
     came = faults.ghosts[np.isfinite(arrives_s) & heard.valid[0, faults.ghosts]]
     # A list belongs to the last instant within a microsecond of its arrival, or the next.
-    number = np.searchsorted(issue_s, heard.arrives_s[0, heard.frame_ix[came]] - _TOLERANCE_S)
+    number = np.searchsorted(issue_s, heard.common_arrives_s[heard.frame_ix[came]] - _TOLERANCE_S)
     for row, k in zip(came.tolist(), number.tolist(), strict=True):
         if k < len(told):
             frame = heard.frame_ix[row]

@@ -158,7 +158,7 @@ def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
 
 
 def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
-    available_ns = scene.t0_ns + np.rint(fused.arrives_s[0] * 1e9).astype(np.int64)
+    available_ns = scene.t0_ns + np.rint(fused.common_arrives_s * 1e9).astype(np.int64)
     streams = zip(*(writer.messages(available_ns) for writer in writers.values()), strict=True)
     for time_ns, beside in zip(available_ns.tolist(), streams, strict=True):
         for channel, data in zip(writers, beside, strict=True):
@@ -168,7 +168,7 @@ def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> It
 def _events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[detail.Event]]:
     """What was detected with each list: detections by the index of the list that was then available."""
     events: dict[int, list[detail.Event]] = {}
-    issue_s, tolerance_s = fused.arrives_s[0], 2e-9 * SAME_INSTANT_NS
+    issue_s, tolerance_s = fused.common_arrives_s, 2e-9 * SAME_INSTANT_NS
     if not len(issue_s):
         return events
     # The others are of other time chunks.

@@ -61,7 +61,7 @@ class Captures:
 
 def captures_of(heard: Tracks) -> Captures:
     """The captures behind the lists that were heard."""
-    came = np.isfinite(heard.arrives_s[0])
+    came = np.isfinite(heard.common_arrives_s)
     order = np.flatnonzero(came)
     order = order[np.lexsort((heard.captured_s[order], heard.frame_unit_ix[order]))]
     return Captures(heard.captured_s[order], heard.frame_unit_ix[order], capture_instants(heard)[order])

@@ -41,7 +41,7 @@ def detect(heard: Tracks, found: Episodes, *, confirm: Confirm, count_earlier: b
     `max_age_s` counts from capture, on top of a list's own way to the receiver.
     """
     heard = replace(heard, arrives_s=np.where(out_of_sequence(heard), np.inf, heard.arrives_s))
-    arrives_s = heard.arrives_s[0, heard.frame_ix]
+    arrives_s = heard.common_arrives_s[heard.frame_ix]
     captured_s = heard.row_captured_s
     order, bounds = _by_object(heard, found, arrives_s)
     not_before_s = np.full(len(found.object_ix), -np.inf) if count_earlier else found.onset_s - _TOLERANCE_S
@@ -66,7 +66,7 @@ def capture_instants(heard: Tracks) -> Int:
     Captures of several units within half the shortest list period of the first one are one instant; two captures of
     one unit never are.
     """
-    came = np.isfinite(heard.arrives_s[0])  # what never arrives is no capture to the receiver
+    came = np.isfinite(heard.common_arrives_s)  # what never arrives is no capture to the receiver
     reach_s = shortest_period_s(heard) / 2 + _TOLERANCE_S
     order = np.flatnonzero(came)
     order = order[np.argsort(heard.captured_s[order], kind="stable")]
@@ -78,7 +78,7 @@ def capture_instants(heard: Tracks) -> Int:
 def shortest_period_s(heard: Tracks) -> float:
     """The shortest of the units' list periods (each the median between two captures), 0 where there is none."""
     periods = []
-    came = np.isfinite(heard.arrives_s[0])
+    came = np.isfinite(heard.common_arrives_s)
     for unit in np.unique(heard.frame_unit_ix[came]):
         captured_s = np.sort(heard.captured_s[(heard.frame_unit_ix == unit) & came])
         if len(captured_s) > 1:
@@ -104,8 +104,8 @@ def _superseded_s(heard: Tracks) -> Float:
     """(F,) when the next list of the same unit arrives; inf for its last."""
     result = np.full(len(heard.stamp_ns), np.inf)
     for unit in np.unique(heard.frame_unit_ix):
-        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(heard.arrives_s[0]))
-        result[mine[:-1]] = heard.arrives_s[0, mine[1:]]
+        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(heard.common_arrives_s))
+        result[mine[:-1]] = heard.common_arrives_s[mine[1:]]
     return result
 
 

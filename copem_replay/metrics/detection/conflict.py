@@ -46,7 +46,7 @@ class ConflictDetector:
         """Take in the fused tracks of runs (S,), `first_run` and on; several of one time chunk may be."""
         fused = fused_tracks.fused
         self._runs = max(self._runs, first_run + len(fused.valid))
-        issue_s = fused.arrives_s[0]
+        issue_s = fused.common_arrives_s
         implied = implied_by(fused, self._ego, self._wanted)
         newest_s = fused_tracks.captured_s
         track_of = {int(o): k for k, o in enumerate(fused.object_ix)}
@@ -82,7 +82,7 @@ class ConflictDetector:
 
 def implied_by(tracks: Tracks, ego: EgoPath, wanted: Conflict) -> Bool:
     """(S, P) which states of tracks imply a collision, at the instants their lists are available."""
-    pieces, bounds = corridors(ego, tracks.arrives_s[0], wanted)
+    pieces, bounds = corridors(ego, tracks.common_arrives_s, wanted)
     implied = np.zeros(tracks.valid.shape, dtype=np.bool_)
     columns = (tracks.x_m, tracks.y_m, tracks.yaw_rad, tracks.vx_mps, tracks.vy_mps, tracks.length_m, tracks.width_m)
     _implied(tracks.valid, _Boxes(*columns), tracks.frame_ix, pieces, bounds, wanted.horizon_s, implied)
