@@ -107,7 +107,7 @@ def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterat
 
 def _fusing(world: WorldChunk, name: str, seen: Tracks, told: ObjectLists) -> tuple[Callable[[], object], int]:
     """Fuses one block of runs as one configuration does; how many lists each run gets."""
-    heard = listen(seen, world.truth, world.experiment, name)
+    heard = listen(seen, world, name)
     configuration = world.experiment.configurations[name]
     age_of_information_s, fusion = configuration.max_age_s, configuration.fusion
     count = len(fusion_schedule(heard, max_age_s=age_of_information_s).issue_s)

@@ -1,24 +1,45 @@
 """Links: when the receiver has each list. The delay of a link comes on top exactly, no rounding to a tick.
 
-A modelled unit sends a list when it is captured, a recorded one when it was recorded.
+A modelled unit sends a list when it is ready, a recorded one when it was recorded.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from copem_replay.core.components import Component, GivenError, Id, NotNegative, asked
-from copem_replay.core.tracks import Float, Int, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
+
+if TYPE_CHECKING:
+    from copem_replay.communication.reception import RadioPath
+    from copem_replay.core.draws import Draws
+
+LINKS = {"radio": "copem_replay.communication.radio:Radio"}
+_TOLERANCE_S = SAME_INSTANT_NS * 1e-9
+
+
+@dataclass(frozen=True)
+class Air:
+    """What else a link may go by, of lists (F,) in one run: their numbers, their ways, and how many objects each has.
+
+    `path`, `objects`: None where no link of the experiment asks for them.
+    """
+
+    draws: Draws
+    path: RadioPath | None
+    objects: Int | None
 
 
 @dataclass(frozen=True)
 class SentLists:
     """The lists (F,) of some units (U,) as they are sent. Times are seconds since the log's start.
+
+    `made (F,)`: which of them there are, None: all. `where`: what stands in the experiment for the link.
 
     >>> cr.SentLists(("rsu",), np.zeros(1, dtype=int), captured_s=np.array([0.1]), sent_s=np.array([0.1])).units
     ('rsu',)
@@ -28,10 +49,13 @@ class SentLists:
     unit_ix: Int  # (F,) the unit that sends each list
     captured_s: Float  # (F,)
     sent_s: Float  # (F,)
+    made: Bool | None = None
+    air: Air | None = None
+    where: str = "link"
 
 
 class LinkModel(Component, ABC):
-    """Base of all links, of a configuration's `link:`. A link is pure: the same lists have the same delays.
+    """Base of all links. A link is pure: the same lists have the same delays.
 
     >>> class Filling(cr.LinkModel):
     ...     def delays_s(self, lists):
@@ -40,15 +64,19 @@ class LinkModel(Component, ABC):
 
     @abstractmethod
     def delays_s(self, lists: SentLists) -> Float:
-        """Seconds from the sending of each list to its arrival: (S | 1, F), 0 or more; inf: the list never arrives.
+        """(1, F) seconds from the sending of each list to its arrival, 0 or more; inf: the list never arrives.
 
-        Arrival times have to be common to all runs: more than one row is refused. The delay of a list depends on the
-        list alone.
+        The delay of a list depends on the list alone, in a link of the user's own: it is the same in all runs.
         """
 
     def fixed_s(self, unit: str) -> float | None:
         """The delay (s) of every list of a unit; None: it differs from list to list, or is not known in advance."""
         return None
+
+    @property
+    def drawn(self) -> bool:
+        """Whether delays differ from run to run."""
+        return False
 
 
 class ConstantLink(LinkModel):
@@ -70,46 +98,67 @@ class ConstantLink(LinkModel):
 
 
 @dataclass(frozen=True)
+class UnitLinks:
+    """A link of a configuration, the units that send by it (None: all), and `where` in the experiment it stands."""
+
+    where: str
+    link: LinkModel
+    units: frozenset[str] | None = None
+
+
+@dataclass(frozen=True)
 class Delays:
-    """The delays that a link gives the lists (F,): `by_run_s (S | 1, F)`. Raises GivenError where they are none."""
+    """The delays that a link gives the lists (F,): `by_run_s (1, F)`. Raises GivenError where they are none."""
 
     by_run_s: Float
     lists: int
 
     def __post_init__(self) -> None:
         given = self.by_run_s
-        if not isinstance(given, np.ndarray) or given.ndim != 2 or given.shape[1] != self.lists:
+        if not isinstance(given, np.ndarray) or given.shape != (1, self.lists):
             found = given.shape if isinstance(given, np.ndarray) else type(given).__name__
             raise GivenError("delays_s", f"expected shape (1, {self.lists}), found {found}")
         if given.dtype.kind not in "fiu" or not (given >= 0).all():  # NaN is not at least 0 either
             raise GivenError("delays_s", "expected seconds of 0 or more (inf: never), found others")
 
-    @property
-    def common_s(self) -> Float:
-        """(1, F) what all runs have in common. Raises GivenError where delays differ by run.
 
-        The receiver's instants are those of all runs of a log: they cannot be computed once from such delays.
-        """
-        if len(self.by_run_s) != 1:
-            raise GivenError(
-                "delays_s",
-                f"expected one row of delays, common to all runs, found {len(self.by_run_s)}; arrival times that "
-                "differ by run are not supported",
-            )
-        return self.by_run_s
-
-
-def transmit(seen: Tracks, link: LinkModel, where: str, heard: Container[str] | None = None) -> Tracks:
+def transmit(
+    seen: Tracks,
+    links: Sequence[UnitLinks],
+    heard: Container[str] | None = None,
+    *,
+    air: Air | None = None,
+    issue_hz: float | None = None,
+) -> Tracks:
     """The same tracks with the arrival times of their lists at the receiver, inf: never.
 
-    `heard`: names of the units whose lists reach the receiver, None: all. Raises InputError, naming `where` the link
-    stands, where a link of the user's own fails.
+    A list takes the delays of all `links` that its unit sends by, one after the other. `heard`: names of the units
+    whose lists reach the receiver, None: all. `issue_hz`: it takes them in at ticks. Raises InputError, naming where a
+    link stands, where one of the user's own fails.
     """
-    made = np.isfinite(seen.common_arrives_s)  # a list that is not made is no concern of the link
-    sent_s = np.where(made, seen.common_arrives_s, seen.captured_s)
-    sent = SentLists(seen.units, seen.frame_unit_ix, seen.captured_s, sent_s)
-    delay_s = asked(link, where, lambda: Delays(link.delays_s(sent), len(sent.sent_s)).common_s)
+    arrives_s = seen.common_arrives_s
+    made = np.isfinite(arrives_s)  # a list that is not made is no concern of a link
+    for one in links:
+        sent_s = np.where(made, arrives_s, seen.captured_s)
+        sent = SentLists(seen.units, seen.frame_unit_ix, seen.captured_s, sent_s, made, air, one.where)
+        delay_s = asked(one.link, one.where, lambda: Delays(one.link.delays_s(sent), len(sent.sent_s)).by_run_s[0])  # noqa: B023
+        if one.units is not None:
+            delay_s = np.where(_of_units(seen, one.units), delay_s, 0.0)
+        arrives_s = arrives_s + delay_s
+        made = made & np.isfinite(delay_s)
     if heard is not None:
-        reaches = np.array([name in heard for name in seen.units], dtype=bool)
-        delay_s = np.where(reaches[seen.frame_unit_ix], delay_s, np.inf)
-    return replace(seen, arrives_s=seen.arrives_s + delay_s)
+        arrives_s = np.where(_of_units(seen, heard), arrives_s, np.inf)
+    if issue_hz is not None:
+        arrives_s = ticks_s(arrives_s, issue_hz)
+    return replace(seen, arrives_s=arrives_s[None])
+
+
+def ticks_s(time_s: Float, rate_hz: float) -> Float:
+    """The first of the instants k / rate at which each time is over, or within a microsecond."""
+    result: Float = np.ceil((time_s - _TOLERANCE_S) * rate_hz) / rate_hz
+    return result
+
+
+def _of_units(seen: Tracks, names: Container[str]) -> Bool:
+    """(F,) which lists are of these units."""
+    return np.array([name in names for name in seen.units], dtype=bool)[seen.frame_unit_ix]

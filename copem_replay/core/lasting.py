@@ -181,6 +181,34 @@ def births(
         count = size
 
 
+def dwelling(rng: CounterRng, purpose: str, random_key: RandomKey, runs: Int, lasts_s: float) -> Float:
+    """(S, P) uniforms in (0, 1) that are below any number for `lasts_s` on average, exponentially.
+
+    "Below a" is the chain of two states that is in it with probability a and leaves it after `lasts_s`, for every a at
+    once: a larger one only adds to the time below. At the instants of a Poisson process, `lasts_s` apart on average,
+    the number starts from 1, and sinks as life / (life + age), with an exponential life of the same mean.
+    """
+    out = np.empty((len(runs), len(random_key.stamp_ns)))
+    if not out.size:
+        return out
+    series, which = np.unique(
+        np.stack([random_key.unit_ix.astype(np.uint64), random_key.object_word]), axis=1, return_inverse=True
+    )
+    stamp = random_key.stamp_ns
+    from_ns, until_ns = int(stamp.min() - FORGOTTEN * lasts_s * 1e9), int(stamp.max()) + 1
+    nobody = np.zeros(series.shape[1], dtype=np.int64)
+    of_series = RandomKey(random_key.units, series[0].astype(np.int64), series[1], nobody)
+    found = births(rng, purpose, of_series, runs, every_s=lasts_s, lasts_s=lasts_s, from_ns=from_ns, until_ns=until_ns)
+    life_ns = (found.gone_ns - found.born_ns).astype(float)
+    for s in range(len(runs)):
+        for k in range(series.shape[1]):
+            mine = np.flatnonzero((found.run_ix == s) & (found.row_ix == k))
+            rows = np.flatnonzero(which == k)
+            last = mine[np.maximum(np.searchsorted(found.born_ns[mine], stamp[rows], side="right") - 1, 0)]
+            out[s, rows] = life_ns[last] / (life_ns[last] + (stamp[rows] - found.born_ns[last]))
+    return np.minimum(out, 1 - 2.0**-53)
+
+
 def level_of(length_ns: float) -> int:
     """The least whole l with 2^l ns no shorter than this."""
     return max(int(np.ceil(np.log2(length_ns))), 0)

@@ -200,6 +200,19 @@ def _configuration(source: Source, key: Key, configuration: dict[str, Any], unit
     for unit in latency if isinstance(latency, dict) else ():
         if unit not in [*units, "default", "truth"]:
             yield source.at((*key, "latency_s", unit), unknown("unit", unit, [*units, "default"]))
+    yield from _link(source, (*key, "link"), configuration.get("link"), units)
+
+
+def _link(source: Source, key: Key, link: object, units: Sequence[str]) -> Iterator[str]:
+    """Links, and units that send by them, that there are not."""
+    there = _names(source.data.get("links"))
+    by_unit = isinstance(link, dict) and "kind" not in link
+    for unit, name in link.items() if isinstance(link, dict) and by_unit else [(None, link)]:
+        if by_unit and str(unit) not in [*units, "default", "truth"]:
+            yield source.at((*key, str(unit)), unknown("unit", unit, [*units, "default"]))
+        if _is_name(name) and str(name) not in [*there, "none"]:
+            known = f"there {'are' if len(there) > 1 else 'is'} {', '.join(there) or 'none'}"
+            yield source.at((*key, str(unit)) if by_unit else key, f"no link {str(name)!r} ({known})")
 
 
 def _inputs(source: Source, key: Key, configuration: dict[str, Any], units: Sequence[str]) -> Iterator[str]:

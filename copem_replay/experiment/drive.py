@@ -12,7 +12,8 @@ from pydantic import ValidationError
 
 from copem_replay.core.text import counted
 from copem_replay.core.yaml import Key
-from copem_replay.experiment.schema import Configuration, Experiment, LogSettings, Unit
+from copem_replay.experiment.log_settings import LogSettings
+from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.metrics.config import Measure, Objects
 
 _INSTEAD = {"on": "at", "at": "on", "pem": "recorded", "recorded": "pem", "classes": "ids", "ids": "classes"}
@@ -96,6 +97,10 @@ def _configurations(experiment: Experiment, units: Mapping[str, Unit]) -> dict[s
         if isinstance(late, dict) and not late.keys() <= {*units, "default", "truth"}:
             changed["latency_s"] = {
                 unit: s for unit, s in late.items() if unit in units or unit not in experiment.units
+            }
+        if isinstance(configuration.link, dict):
+            changed["link"] = {
+                unit: link for unit, link in configuration.link.items() if unit in units or unit not in experiment.units
             }
         if there or not before:
             kept[name] = configuration.model_copy(update=changed) if changed else configuration

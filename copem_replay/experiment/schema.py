@@ -15,15 +15,17 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    SerializerFunctionWrapHandler,
     Tag,
     field_validator,
     model_serializer,
     model_validator,
 )
 
-from copem_replay.communication.link import ConstantLink, LinkModel
-from copem_replay.core.components import Count, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
+from copem_replay.communication.latency import Delay
+from copem_replay.communication.link import LINKS, ConstantLink, LinkModel, UnitLinks
+from copem_replay.core.components import Count, Frozen, Id, Latency, Positive, Slot, at_key, described
+from copem_replay.core.tracks import TRUTH
+from copem_replay.experiment.log_settings import LogEntry
 from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
@@ -59,6 +61,25 @@ def _configuration_name(value: str) -> str:
     return value
 
 
+def _link_name(value: str) -> str:
+    if value in ("none", "default", ""):
+        raise ValueError(f"{value!r} cannot be a link's name")
+    return value
+
+
+def _what_link(value: object) -> str:
+    if isinstance(value, LinkModel) or (isinstance(value, dict) and "kind" in value):
+        return "link"
+    return "by unit" if isinstance(value, dict) else "name"
+
+
+LinkName = Annotated[Id, AfterValidator(_link_name)]
+AnyLink = Annotated[LinkModel, Slot("link", LINKS, "radio")]
+LinkOf = Annotated[
+    Annotated[AnyLink, Tag("link")] | Annotated[Id, Tag("name")] | Annotated[dict[Id, Id], Tag("by unit")],
+    Discriminator(_what_link),
+]
+"""A link: by its name, by unit with `default`, or as it is."""
 UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 
@@ -67,19 +88,22 @@ _NOT_RECORDED = {
     "placed": "is where its lists say",
     "clock": "captures when its lists say",
     "outages": "makes the lists that are recorded",
+    "ready": "arrives when its lists say",
 }
 
 
 class Unit(Placement):
     """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
-    One whose lists are recorded has no PEM, and needs a place only where distances are measured from it.
+    One whose lists are recorded has no PEM, and needs a place only where distances are measured from it. `ready`: how
+    long after its capture a list is there to be sent.
 
     >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
     True
     """
 
     recorded: Recorded | None = None
+    ready: Delay | None = Field(default=None, exclude_if=lambda ready: ready is None)
 
     @model_validator(mode="after")
     def _place(self) -> Self:
@@ -105,8 +129,14 @@ class Unit(Placement):
         return self
 
 
+IssueRate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
+"""Fused lists per second."""
+
+
 class Configuration(Frozen):
-    """What is compared: which units, which fusion, which latency, by unit or not, or which `link` of the user's own.
+    """What is compared: which units, which fusion, which `link` and on top which latency, by unit or not.
+
+    `issue_hz`: how often the receiver issues fused lists; left out, whenever a list arrives.
 
     Or a stack's `recorded` output, and the recorded units it had as `inputs`: ideal fusion of these is what its regret
     is to.
@@ -121,7 +151,8 @@ class Configuration(Frozen):
     inputs: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] = Ideal()
     latency_s: Latency | dict[Id, Latency] = 0.0
-    link: Annotated[LinkModel, Slot("link", {})] | None = Field(default=None, exclude_if=lambda link: link is None)
+    link: LinkOf | None = Field(default=None, exclude_if=lambda link: link is None)
+    issue_hz: IssueRate | None = Field(default=None, exclude_if=lambda rate: rate is None)
     max_age_s: Positive = 1.0
 
     @model_validator(mode="after")
@@ -141,74 +172,14 @@ class Configuration(Frozen):
         output = self.recorded is not None
         return {k: v for k, v in dump(self).items() if (k in ("recorded", "inputs")) == output and (v or not output)}
 
-    @model_validator(mode="after")
-    def _one_link(self) -> Self:
-        if self.link is not None and self.latency_s:
-            raise ValueError("link: expected either `latency_s` or `link`, found both")
-        return self
+    def latency_of(self, unit: str) -> float:
+        """Seconds that `latency_s` adds to the way of every list of a unit."""
+        return ConstantLink(latency_s=self.latency_s).fixed_s(unit)
 
-    @property
-    def link_model(self) -> LinkModel:
-        """The link to the receiver: the declared one, else that of `latency_s`."""
-        return ConstantLink(latency_s=self.latency_s) if self.link is None else self.link
-
-    def latency_of(self, unit: str) -> float | None:
-        """Seconds from capture to arrival of every list of a unit; None: they differ from list to list."""
-        return self.link_model.fixed_s(unit)
-
-
-MEASURED_PER_LOG = ("objects", "onset", "distance_to", "annotated")
-"""Keys of `measure` that a log may have its own of; the others say what the tables of all logs have in common."""
-
-
-class LogSettings(Frozen):
-    """A recording, and what is otherwise for it: keys that are given replace those of the experiment, lists whole.
-
-    `file`: as a plain entry, wildcards too. `name`: what the log is called, by default as its file. Of `units` and
-    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it. `together`, in the place of
-    `file`: several recordings of one drive; `clock_offset_s`: how far the clock of one is ahead of the first one's.
-    """
-
-    file: Annotated[str, Field(min_length=1)] | None = None
-    together: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)] | None = None
-    clock_offset_s: dict[str, Number] = Field(default_factory=dict)
-    name: Annotated[Id, Field(min_length=1)] | None = None
-    ego: Ego | None = None
-    window_s: WindowOf | None = None
-    units: dict[Id, dict[str, Any] | None] = Field(default_factory=dict)
-    obstacles: tuple[Obstacle, ...] | None = None
-    read: HowRead | None = None
-    measure: dict[str, Any] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _one_place(self) -> Self:
-        if (self.file is None) == (self.together is None):
-            raise ValueError("expected one of `file: <recording>` and `together: [<recording>, <recording>]`")
-        paths = self.together or ()
-        if len(set(paths)) < len(paths):
-            raise ValueError(f"together: expected each recording once, found {max(paths, key=paths.count)!r} twice")
-        for name, offset_s in self.clock_offset_s.items():
-            if name not in paths:
-                expected = ", ".join(paths[1:]) or "none without `together`"
-                raise ValueError(f"clock_offset_s: expected a recording of `together` ({expected}), found {name!r}")
-            if name == paths[0] and offset_s:
-                raise ValueError(f"clock_offset_s: {name!r} is the first, by whose clock the others are ahead")
-        return self
-
-    @field_validator("measure")
-    @classmethod
-    def _of_a_log(cls, measure: dict[str, Any]) -> dict[str, Any]:
-        for key in measure:
-            if key not in MEASURED_PER_LOG:
-                names = ", ".join(MEASURED_PER_LOG)
-                raise ValueError(f"{key}: goes for all logs alike; a log has its own {names}")
-        return measure
-
-    @model_serializer(mode="wrap")
-    def _as_given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Only keys that are given: a `null` would be one, too."""
-        written: dict[str, Any] = write(self)
-        return {key: value for key, value in written.items() if key in self.model_fields_set}
+    def link_of(self, unit: str) -> str | LinkModel | None:
+        """The link that a unit sends by, or its name; None: there is none but `latency_s`."""
+        link = self.link.get(unit, self.link.get("default", "none")) if isinstance(self.link, dict) else self.link
+        return None if link == "none" else link
 
 
 def output_unit(configuration: str) -> str:
@@ -220,7 +191,7 @@ def ideal_over(configurations: Mapping[str, Configuration], inputs: Sequence[str
     """The configuration that is ideal fusion of these very units without latency; None: there is none."""
     for name, one in configurations.items():
         alike = one.recorded is None and not isinstance(one.units, str) and set(one.units) == set(inputs)
-        if alike and one.fusion == Ideal() and one.link is None and not one.latency_s:
+        if alike and one.fusion == Ideal() and one.link is None and not one.latency_s and one.issue_hz is None:
             return name
     return None
 
@@ -235,14 +206,6 @@ def _with_ideals(configurations: dict[str, Configuration]) -> dict[str, Configur
             raise ValueError(f"{name}:ideal: expected ideal fusion of the inputs of {name}, found another; rename it")
         result[f"{name}:ideal"] = Configuration(units=one.inputs)
     return result
-
-
-def _what_log(value: object) -> str:
-    return "settings" if isinstance(value, dict | LogSettings) else "path"
-
-
-LogEntry = Annotated[Annotated[str, Tag("path")] | Annotated[LogSettings, Tag("settings")], Discriminator(_what_log)]
-"""A path, with wildcards or not, or a mapping with settings."""
 
 
 WhichRun = Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst", "best"]
@@ -304,6 +267,7 @@ class Experiment(Frozen):
     units: dict[UnitName, Unit] = Field(default_factory=dict)
     obstacles: tuple[Obstacle, ...] = ()
     visibility: Visibility = Field(default=Surface(), json_schema_extra={"default": "surface"})
+    links: dict[LinkName, AnyLink] = Field(default_factory=dict, exclude_if=lambda links: not links)
     configurations: Annotated[dict[ConfigurationName, Configuration], Field(min_length=1)]
     measure: Measure = Measure()
     braking: Braking | None = None
@@ -337,6 +301,30 @@ class Experiment(Frozen):
         if configuration.units == "all":
             return tuple(self.modelled)
         return tuple(name for name in self.units if name in configuration.units)
+
+    def links_of(self, name: str) -> list[UnitLinks]:
+        """The links of a configuration: those that its units send by, and last what `latency_s` adds."""
+        configuration = self.configurations[name]
+        units = self.units_of(configuration) or (TRUTH,)
+        by_link: dict[str, list[str]] = {}
+        found: dict[str, LinkModel] = {}
+        for unit in units:
+            link = configuration.link_of(unit)
+            if link is not None:
+                where = f"links.{link}" if isinstance(link, str) else f"configurations.{name}.link"
+                found[where] = self.links[link] if isinstance(link, str) else link
+                by_link.setdefault(where, []).append(unit)
+        every = len(by_link) == 1 and len(*by_link.values()) == len(units)
+        added = UnitLinks(f"configurations.{name}.latency_s", ConstantLink(latency_s=configuration.latency_s))
+        return [UnitLinks(w, link, None if every else frozenset(by_link[w])) for w, link in found.items()] + [added]
+
+    def delay_of(self, name: str, unit: str) -> float | None:
+        """Seconds from capture to arrival of the lists of a unit in a configuration; None: they differ."""
+        one = self.units.get(unit)
+        ready_s = one.ready.fixed_s if one is not None and one.ready is not None else 0.0
+        links = [of.link.fixed_s(unit) for of in self.links_of(name) if of.units is None or unit in of.units]
+        parts = [part for part in (ready_s, *links) if part is not None]
+        return sum(parts) if len(parts) == len(links) + 1 else None
 
     def shown(self) -> dict[str, Configuration]:
         """The configurations that are written to MCAP and .rrd."""

@@ -38,12 +38,14 @@ def fixed_in(experiment: Mapping[str, Any]) -> Fixed:
     What is not said is taken to be drawn.
     """
     units = _mapping(experiment.get("units"))
+    links = _mapping(experiment.get("links"))
     recorded = {name for name, unit in units.items() if _mapping(unit).get("recorded")}
-    lists = {
-        str(name)
-        for name, said in _mapping(experiment.get("configurations")).items()
-        if _mapping(said).get("recorded") or _not_drawn(_mapping(said).get("units"), recorded)
-    }
+    lists = set()
+    for name, configuration in _mapping(experiment.get("configurations")).items():
+        said = _mapping(configuration)
+        alike = _not_drawn(said.get("units"), recorded) and not _by_chance(said.get("link"), links)
+        if said.get("recorded") or alike:
+            lists.add(str(name))
     driver = _mapping(_mapping(experiment.get("braking")).get("driver"))
     reaction = driver.get("reaction")  # left out, it is no delay at all
     return Fixed(frozenset(lists), bool(driver) and (not reaction or _mapping(reaction).get("kind") == "constant"))
@@ -51,6 +53,19 @@ def fixed_in(experiment: Mapping[str, Any]) -> Fixed:
 
 def _not_drawn(units: Any, recorded: set[str]) -> bool:
     return units == TRUTH or (isinstance(units, list) and set(units) <= recorded)
+
+
+def _by_chance(link: Any, links: Mapping[str, Any]) -> bool:
+    """Whether a configuration's link, or any of those by unit, delays or loses lists by chance."""
+    by_unit = link.values() if isinstance(link, dict) and "kind" not in link else [link]
+    for one in by_unit:
+        said = links.get(one) if isinstance(one, str) else one
+        radio = _mapping(said)
+        latency, reception = _mapping(radio.get("latency")), _mapping(radio.get("reception"))
+        sure = latency.get("kind") == "constant" and reception == {"kind": "constant", "probability": 1.0}
+        if radio.get("kind") == "radio" and not (sure and not radio.get("channel")):
+            return True
+    return False
 
 
 def _mapping(said: Any) -> Mapping[str, Any]:

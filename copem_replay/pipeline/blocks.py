@@ -93,7 +93,7 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
     measure = experiment.measure
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_all(experiment)
     units = replay.expanded.with_(experiment)
-    if by_entry and not units.outages:
+    if by_entry and not units.arrivals_differ:
         return [_block(replay, experiment, runs, presence)]
     # Which lists there are decides what is consecutive: runs with the same units go together.
     parts = list(presence.parts(runs))
@@ -112,7 +112,7 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence
     if everything or measure.conflict is not None:
         receivers = Receivers(runs, presence.sending)
         judges: dict[str, _Judge] = {}
-        for world in replay.worlds(experiment, runs, presence.sending, measured_only=not everything):
+        for world in replay.worlds(experiment, runs, presence, measured_only=not everything):
             around = replay.truth_cache_of(world.chunk)
             for name, output in receivers.receive(world):
                 if name not in judges:
@@ -196,10 +196,12 @@ def _by_truth_id(
     chosen = {name: c for name, c in units.configurations.items() if by_truth(c)}
     if not chosen:
         return {}
+    on_air = replay.on_air(experiment, runs, presence.listing)
+    lists = WorldChunk(replay.scene, replay.truth, replay.measured, replay.recorded, units, on_air=on_air)
     seen = _sightings(replay, units, runs, presence)
     events: dict[str, Events] = {}
     for name, configuration in chosen.items():
-        heard = listen(seen, replay.truth, units, name, presence.sending)
+        heard = listen(seen, lists, name, presence.sending)
         result = detect(
             heard,
             replay.episodes,

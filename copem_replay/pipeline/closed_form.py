@@ -26,10 +26,13 @@ from copem_replay.metrics.braking.verdict import fail_probability, pass_probabil
 from copem_replay.metrics.detection.by_truth_id import capture_instants
 from copem_replay.metrics.detections_table import distances
 from copem_replay.metrics.end_reason import texts_of
+from copem_replay.metrics.lasting_survival import Lasting
 from copem_replay.metrics.log_survival import FirstKnown, confirmed, first_of
+from copem_replay.pipeline.exact_links import exactly_heard
+from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.lasting_detection import check_lasting, lasting
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.pipeline.receiver import by_truth, listen
+from copem_replay.pipeline.receiver import by_truth
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
@@ -82,26 +85,28 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
         units = replay.expanded.with_(of_log(experiment, replay.scene.log))
         for name in units.configurations:
             lasts = check_lasting(units, name, hits)
-            if hits == 1 and not lasts:
+            if hits == 1 and not lasts and not units.arrivals_differ:
                 continue
-            heard = listen(replay.measured.tracks, replay.truth, units, name)
+            heard, received = exactly_heard(replay, units, name, hits)
             if hits > 1:
                 _shared_instants(replay, heard, name)
             else:
-                lasting(replay, units, name, heard)
+                _lasting(replay, units, name, heard, received)
 
 
 def distributions(replay: Replay, experiment: Experiment, name: str) -> list[FirstKnown]:
     """For each episode when it is first known."""
     units, episodes, confirm = replay.expanded.with_(experiment), replay.episodes, experiment.measure.confirm
     configuration = units.configurations[name]
-    heard = listen(replay.measured.tracks, replay.truth, units, name)
+    heard, received = exactly_heard(replay, units, name, confirm.hits)
     # A model of the user's own may be above 1 by rounding.
     listed = (
         np.ones(len(heard.frame_ix)) if configuration.units == TRUTH else np.minimum(replay.measured.probability, 1)
     )
+    if (received < 1).any():
+        listed = listed * received[heard.frame_ix]
     instants = _shared_instants(replay, heard, name) if confirm.hits > 1 else None
-    lasts = None if instants is not None else lasting(replay, units, name, heard)
+    lasts = None if instants is not None else _lasting(replay, units, name, heard, received)
     arrives_s = heard.common_arrives_s[heard.frame_ix]
     by_object = np.argsort(heard.row_object_ix, kind="stable")
     first, last = (
@@ -122,6 +127,19 @@ def distributions(replay: Replay, experiment: Experiment, name: str) -> list[Fir
             instant = instants[heard.frame_ix[rows]]
             result.append(confirmed(instant, arrives_s[rows], listed[rows], confirm.hits, confirm.of))
     return result
+
+
+def _lasting(
+    replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tracks, received: Float
+) -> Lasting | None:
+    """How detection lasts. Raises ExperimentError where lists, `received (F,)` with a probability, are lost, too."""
+    lasts = lasting(replay, experiment, name, heard)
+    if lasts is not None and (received < 1).any():
+        raise ExperimentError(
+            f"exact: configuration {name}: detection lasts and lists are lost, and both together have no closed form "
+            "here; leave one of them, or leave exact out"
+        )
+    return lasts
 
 
 def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from copem_replay.communication.latency import LatencyModel
+from copem_replay.communication.link import UnitLinks
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
@@ -107,13 +109,31 @@ class ExpandedExperiment:
 
     @property
     def outages(self) -> bool:
-        """Whether a unit at times makes no lists: each run then has lists, and instants, of its own."""
+        """Whether a unit at times makes no lists."""
         return any(unit.outages is not None for unit in self.modelled.values())
+
+    @property
+    def ready(self) -> dict[str, LatencyModel]:
+        """How long units take until a list is there to be sent, of those that take any time."""
+        return {name: unit.ready for name, unit in self.modelled.items() if unit.ready is not None}
+
+    def links_of(self, name: str) -> list[UnitLinks]:
+        """The links of one of these configurations."""
+        return self._expanded.links_of(name)
+
+    @property
+    def arrivals_differ(self) -> bool:
+        """Whether lists arrive otherwise from run to run: each run then has lists, and instants, of its own."""
+        return (
+            self.outages
+            or any(ready.fixed_s is None for ready in self.ready.values())
+            or any(one.link.drawn for name in self.configurations for one in self.links_of(name))
+        )
 
     @property
     def runs_apart(self) -> bool:
         """Whether lists differ from run to run in more than the states of their rows: a block then has one run."""
-        return self.outages or any(
+        return self.arrivals_differ or any(
             isinstance(configuration.fusion, ListFusion)
             and any(self._apart(self.units[name]) for name in self.units_of(configuration))
             for configuration in self.configurations.values()
@@ -236,6 +256,10 @@ def _members_for(configurations: dict[str, Configuration], members: dict[str, li
         if isinstance(configuration.latency_s, dict):
             changed["latency_s"] = {
                 one: value for unit, value in configuration.latency_s.items() for one in members.get(unit, [unit])
+            }
+        if isinstance(configuration.link, dict):
+            changed["link"] = {
+                one: link for unit, link in configuration.link.items() for one in members.get(unit, [unit])
             }
         result[name] = configuration.model_copy(update=changed)
     return result

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from copem_replay.communication.arrivals import fusion_schedule
-from copem_replay.core.tracks import SAME_INSTANT_NS, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, Int
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
@@ -17,19 +17,18 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
     """For each configuration how many intervals there are between fused lists issued while the log lasts, and the
     seconds they cover.
 
-    Units that only some runs have are taken to be there. Where units have outages it is all runs together.
+    Units that only some runs have are taken to be there. Where arrivals differ it is all runs together.
     """
-    world = replay.lists_only(experiment)
-    runs = experiment.runs if world.experiment.outages else 1
-    of_run = [_rates(world, seen_by_all(world, np.array([run]), states="true")) for run in range(runs)]
+    runs = experiment.runs if replay.expanded.with_(experiment).arrivals_differ else 1
+    of_run = [_rates(replay.lists_only(experiment, np.array([run])), np.array([run])) for run in range(runs)]
     return {name: (sum(r[name][0] for r in of_run), sum(r[name][1] for r in of_run)) for name in of_run[0]}
 
 
-def _rates(world: WorldChunk, seen: Tracks) -> dict[str, tuple[int, float]]:
-    """Of one run."""
-    rates = {}
+def _rates(world: WorldChunk, run: Int) -> dict[str, tuple[int, float]]:
+    """Of one run (1,)."""
+    rates, seen = {}, seen_by_all(world, run, states="true")
     for name, configuration in world.experiment.configurations.items():
-        heard = listen(seen, world.truth, world.experiment, name)
+        heard = listen(seen, world, name)
         issue_s = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s
         issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= world.scene.end_s + _TOLERANCE_S)]
         rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)

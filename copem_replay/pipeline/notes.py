@@ -59,7 +59,7 @@ def _remembered_in_vain(experiment: Experiment) -> Iterator[str]:
 
 def same_instants(ready: Sequence[Replay]) -> bool:
     """Whether all runs have the same units, and lists at the same instants."""
-    return all(replay.expanded.same_in_all_runs and not replay.expanded.outages for replay in ready)
+    return all(replay.expanded.same_in_all_runs and not replay.expanded.arrivals_differ for replay in ready)
 
 
 def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
@@ -82,7 +82,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
-        late = [unit for unit in units if (configuration.latency_of(unit) or 0.0) > end_s]
+        late = [unit for unit in units if (experiment.delay_of(name, unit) or 0.0) > end_s]
         if late:
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
 

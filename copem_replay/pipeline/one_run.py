@@ -54,7 +54,7 @@ class RunTracks:
         replay, runs = self.replay, np.array([self.run])
         [(_, presence)] = Presence.of(replay.expanded, replay.scene.log, runs).parts(runs)
         receivers = Receivers(runs, presence.sending)
-        for world in replay.worlds(self.experiment, runs, presence.sending):
+        for world in replay.worlds(self.experiment, runs, presence):
             around = replay.truth_cache_of(world.chunk)
             result = {}
             for name, one in receivers.receive(world):

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import at_instants
 from copem_replay.core.time_chunk import WHOLE, TimeChunk
@@ -25,6 +26,8 @@ from copem_replay.perception.observation import KeptShares, Observations, joined
 from copem_replay.perception.sensor_poses import SensorPoses, place
 from copem_replay.pipeline.chunking import Reach, time_chunks
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand
+from copem_replay.pipeline.on_air import OnAir, asks_for_path, has_channel, paths
+from copem_replay.pipeline.presence import Presence
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
 from copem_replay.pipeline.scoring import TruthCache
 from copem_replay.pipeline.stated_captures import stated_captures
@@ -127,19 +130,20 @@ class Replay:
         return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units, placed=self.placed)
 
     def worlds(
-        self, experiment: Experiment, runs: Int, sending: Bool | None, *, measured_only: bool = False
+        self, experiment: Experiment, runs: Int, presence: Presence, *, measured_only: bool = False
     ) -> Iterator[WorldChunk]:
         """The same chunk by chunk, all of it or what is looked at, for runs (S,) that have the same lists.
 
-        `sending (U,)`: the units whose lists the receivers hear, None: all.
+        `presence`: which units there are.
         """
+        sending, equipped = presence.sending, presence.listing
         if self.chunks == (WHOLE,):
-            whole = self.world(experiment)
+            whole = replace(self.world(experiment), on_air=self.on_air(experiment, runs, equipped))
             yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
-        lists = self.lists_only(experiment)
+        lists = self.lists_only(experiment, runs[:1], equipped)
         units, seen = lists.experiment, seen_by_all(lists, runs[:1], states="true")
-        heard = {name: listen(seen, lists.truth, units, name, sending) for name in units.configurations}
+        heard = {name: listen(seen, lists, name, sending) for name in units.configurations}
         stated = None
         if units.runs_apart:
             stated = {name: stated_captures(self.scene, of, units, int(runs[0])) for name, of in heard.items()}
@@ -156,15 +160,42 @@ class Replay:
                 chunk,
                 self.placed,
                 earliest_s,
+                lists.on_air,
             )
 
-    def lists_only(self, experiment: Experiment) -> WorldChunk:
-        """The same without what is in the lists."""
+    def lists_only(self, experiment: Experiment, runs: Int | None = None, equipped: Bool | None = None) -> WorldChunk:
+        """The same without what is in the lists. Of runs (S,), of which there is one where arrivals are drawn."""
         none = np.empty(0, dtype=np.int64)
         found = observations(self.scene, self.truth, self.expanded, self.placed, from_s=np.inf)
         recorded = None if self.recorded is None else self.recorded.captured_between(np.inf, np.inf)
         units = self.expanded.with_(experiment)
-        return WorldChunk(self.scene, self.truth.take_rows(none), found, recorded, units)
+        on_air = None if runs is None else self.on_air(experiment, runs, equipped)
+        return WorldChunk(self.scene, self.truth.take_rows(none), found, recorded, units, on_air=on_air)
+
+    def on_air(self, experiment: Experiment, runs: Int, equipped: Bool | None) -> OnAir | None:
+        """What drawn links go by in one run (1,); None: no link is drawn. `equipped (1, U)`: which units list."""
+        units = self.expanded.with_(experiment)
+        if not units.arrivals_differ:
+            return None
+        path = self.paths if asks_for_path(units, self.scene) else None
+        return OnAir(int(runs[0]), path, self._listed(units, runs, equipped) if has_channel(units) else None)
+
+    def _listed(self, units: ExpandedExperiment, runs: Int, equipped: Bool | None) -> Int:
+        """(F,) how many objects each list of one run has; ghosts are not counted."""
+        counts = np.zeros(0, dtype=np.int64)
+        for chunk in self.chunks:
+            recorded = None if self.recorded is None else self.recorded.captured_between(chunk.from_s, chunk.until_s)
+            world = WorldChunk(self.scene, self.truth, self.found(chunk).listable, recorded, units, chunk)
+            seen = seen_by_all(world, runs, states="true", equipped=equipped)
+            of_chunk = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
+            counts = of_chunk + counts if len(counts) else of_chunk
+        return counts
+
+    @cached_property
+    def paths(self) -> RadioPath:
+        """The way of each list of all units to the ego."""
+        lists = seen_by_all(self.lists_only(self.expanded.written), np.zeros(1, dtype=np.int64), states="true")
+        return paths(self.rows_of(np.array([self.scene.ego_ix])), self.scene, self.expanded, lists)
 
 
 def prepare(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:

@@ -11,6 +11,7 @@ import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.link import transmit
+from copem_replay.communication.ready import when_ready
 from copem_replay.core.followed import followed_by
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import ObjectLists, TellsOf
@@ -34,6 +35,7 @@ from copem_replay.pipeline.stated_captures import StatedCaptures, stated_capture
 if TYPE_CHECKING:
     from copem_replay.io.recorded_units import RecordedUnits
     from copem_replay.perception.sensor_poses import SensorPoses
+    from copem_replay.pipeline.on_air import OnAir
 
 States = Literal["true", "expected", "sampled"]
 
@@ -44,7 +46,7 @@ class WorldChunk:
 
     `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
     unit per carrier. What was captured before the time chunk and is needed in it is there, too, since `earliest_s`.
-    `placed`: where the units are, for what they list of nobody.
+    `placed`: where the units are, for what they list of nobody. `on_air`: what drawn links go by.
     """
 
     scene: Scene
@@ -55,6 +57,7 @@ class WorldChunk:
     chunk: TimeChunk = WHOLE
     placed: SensorPoses | None = None
     earliest_s: float = -np.inf
+    on_air: OnAir | None = None
 
 
 @dataclass(frozen=True)
@@ -106,8 +109,8 @@ def seen_by_all(
 ) -> Tracks:
     """What every unit lists in the runs (S,), whatever its lists come from. `equipped (S, U)` as in `perceive`.
 
-    Where units have outages, which lists there are differs from run to run: it is asked for one run at a time. So it is
-    with `ghosts`, rows without an object: they come after those of objects, and before what is recorded.
+    Where units have outages, or `ready` is drawn, lists differ from run to run: they are asked for one run at a time.
+    So it is with `ghosts`, rows without an object: they come after those of objects, and before what is recorded.
     """
     experiment = world.experiment
     if equipped is not None:
@@ -117,6 +120,7 @@ def seen_by_all(
         drawn = ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
         seen = followed_by(seen, with_states(world.scene, ghosts.found.tracks, ghosts.found, experiment, drawn))
     seen = without_outages(world.scene, seen, experiment, runs)
+    seen = when_ready(seen, experiment.ready, CounterRng(experiment.seed, world.scene.log), runs)
     if world.recorded is None:
         return seen
     recorded = world.recorded.tracks
@@ -128,20 +132,28 @@ def seen_by_all(
     return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
 
 
-def listen(seen: Tracks, truth: Tracks, experiment: ExpandedExperiment, name: str, there: Bool | None = None) -> Tracks:
+def listen(
+    seen: Tracks,
+    world: WorldChunk,
+    name: str,
+    there: Bool | None = None,
+) -> Tracks:
     """What reaches the receiver of the configuration `name`: the lists of its units, late; those of the others never.
 
     `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn
     for them. Raises InputError where a link of the user's own fails.
     """
-    configuration = experiment.configurations[name]
-    link, where = configuration.link_model, f"configurations.{name}.link"
-    if configuration.units == TRUTH:
-        return transmit(truth, link, where)
+    experiment, scene, on_air = world.experiment, world.scene, world.on_air
+    configuration, links = experiment.configurations[name], experiment.links_of(name)
+    of_truth = configuration.units == TRUTH
+    lists = world.truth if of_truth else seen
+    air = None if on_air is None else on_air.of(lists, scene, experiment.seed)
+    if of_truth:
+        return transmit(lists, links, air=air, issue_hz=configuration.issue_hz)
     heard = set(experiment.units_of(configuration))
     if there is not None:
         heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
-    return transmit(seen, link, where, heard)
+    return transmit(seen, links, heard, air=air, issue_hz=configuration.issue_hz)
 
 
 def by_truth(configuration: Configuration) -> bool:
@@ -187,7 +199,7 @@ class Receivers:
             max_age_s = configuration.max_age_s
             posterior = isinstance(fusion, Ideal) and fusion.combine == "posterior" and not of_truth
             states: States = "expected" if posterior else "sampled"
-            heard = listen(seen_in(states), world.truth, experiment, name, self._there)
+            heard = listen(seen_in(states), world, name, self._there)
             if name not in self._schedules:
                 self._schedules[name] = fusion_schedule(heard, max_age_s=max_age_s)
             faults = None if of_truth else _faults(world, seen_in(states), None if posterior else ghosts)

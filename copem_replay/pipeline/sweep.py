@@ -125,8 +125,6 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
     units = [experiment.units[name] for name in experiment.units_of(configuration)]
     if kind == "units":
         return any(not _is_ego(unit) for unit in units)
-    if kind == "latency_s" and configuration.link is not None:
-        return False
     if kind == "latency_s" and isinstance(configuration.latency_s, dict):
         return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
     if kind == "rate_hz":

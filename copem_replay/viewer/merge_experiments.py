@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from copem_replay.communication.link import LinkModel
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.perception.pem.model import Pem
 
@@ -26,6 +27,7 @@ def merged(parts: Sequence[Part]) -> Experiment:
     units: dict[str, Unit] = {}
     pems: dict[str, Pem] = {}
     configurations: dict[str, Configuration] = {}
+    links: dict[str, LinkModel] = {}
     for part in parts:
         called: dict[str, str] = {}
         for name, unit in part.experiment.units.items():
@@ -34,9 +36,12 @@ def merged(parts: Sequence[Part]) -> Experiment:
             units[called[name]] = unit if pem is None else unit.model_copy(update={"pem": called[name]})
             if pem is not None:
                 pems[called[name]] = pem
+        mine = part.experiment.links
+        same = {name: name if links.get(name, link) == link else f"{part.name}:{name}" for name, link in mine.items()}
+        links |= {same[name]: link for name, link in mine.items()}
         for name, label in part.labels.items():
-            configurations[label] = _with(part.experiment, part.experiment.configurations[name], called)
-    changed = {"units": units, "pems": pems, "configurations": configurations, "sweep": None}
+            configurations[label] = _with(part.experiment, part.experiment.configurations[name], called, same)
+    changed = {"units": units, "pems": pems, "links": links, "configurations": configurations, "sweep": None}
     return parts[0].experiment.model_copy(update=changed)
 
 
@@ -53,8 +58,10 @@ def _called(
     return wanted
 
 
-def _with(experiment: Experiment, configuration: Configuration, called: Mapping[str, str]) -> Configuration:
-    """A configuration that names its units as they are called in the merged experiment."""
+def _with(
+    experiment: Experiment, configuration: Configuration, called: Mapping[str, str], links: Mapping[str, str]
+) -> Configuration:
+    """A configuration that names its units, and its links, as they are called in the merged experiment."""
     changed: dict[str, object] = {}
     if configuration.units != "truth":
         changed["units"] = tuple(called[name] for name in experiment.units_of(configuration))
@@ -62,4 +69,8 @@ def _with(experiment: Experiment, configuration: Configuration, called: Mapping[
         changed["inputs"] = tuple(called[name] for name in configuration.inputs)
     if isinstance(configuration.latency_s, dict):
         changed["latency_s"] = {called.get(unit, unit): late for unit, late in configuration.latency_s.items()}
+    if isinstance(configuration.link, str):
+        changed["link"] = links.get(configuration.link, configuration.link)
+    if isinstance(configuration.link, dict):
+        changed["link"] = {called.get(unit, unit): links.get(link, link) for unit, link in configuration.link.items()}
     return configuration.model_copy(update=changed)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from copem_replay.communication.link import ConstantLink, LinkModel, SentLists, transmit
+from copem_replay.communication.link import ConstantLink, LinkModel, SentLists, UnitLinks, transmit
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
@@ -118,24 +118,25 @@ class TestOneFromOutside:
 
     def test_it_is_in_the_schema(self) -> None:
         schema = Experiment.model_json_schema()
-        [own, none] = schema["$defs"]["Configuration"]["properties"]["link"]["anyOf"]
-        assert own["properties"]["kind"]["pattern"] == ":"
-        assert none == {"type": "null"}
+        [link, none] = schema["$defs"]["Configuration"]["properties"]["link"]["anyOf"]
+        [[radio, own], name, by_unit] = [link["oneOf"][0]["anyOf"], *link["oneOf"][1:]]
+        assert (radio["properties"]["kind"]["const"], own["properties"]["kind"]["pattern"]) == ("radio", ":")
+        assert (name["type"], by_unit["type"], none) == (["string", "integer"], "object", {"type": "null"})
 
     def test_written_and_read_back_it_is_the_same(self) -> None:
         assert Experiment.model_validate(self.PLAN.as_written()) == self.PLAN
 
-    def test_a_sweep_of_latency_leaves_it_as_it_is(self) -> None:
+    def test_a_sweep_of_latency_adds_to_it(self) -> None:
         plan = linked({"kind": f"{HERE}:Filling"}, sweep={"latency_s": [0, 1], "configurations": ["PEM"]})
-        assert list(points(plan)) == []
-        assert without_points(plan) == ["sweep of latency_s: it changes no configuration"]
+        assert without_points(plan) == []
+        [swept] = [outcome(point.experiment).table["detection_s"] for point in points(plan) if point.value == 1]
+        assert swept.tolist() == pytest.approx([6.1])
 
 
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        ("by run", r"expected one row of delays, common to all runs, found 2; arrival times that differ by run are not "
-                   "supported"),
+        ("by run", r"expected shape \(1, 81\), found \(2, 81\)"),
         ("flat", r"expected shape \(1, 81\), found \(81,\)"),
         ("few", r"expected shape \(1, 81\), found \(1, 82\)"),
         ("early", r"expected seconds of 0 or more \(inf: never\), found others"),
@@ -156,10 +157,8 @@ def test_delays_that_cannot_be_used_are_refused(how: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"latency_s": 0.5, "link": {"kind": f"{HERE}:Filling"}}, "either `latency_s` or `link`, found both"),
-        ({"latency_s": {"ego": 0.5}, "link": {"kind": f"{HERE}:Filling"}}, "either `latency_s` or `link`, found both"),
-        ({"link": {"kind": "constant"}}, "kind: expected package.module:Class; found 'constant'"),
-        ({"link": 0.5}, r"expected {kind: …}, kind package.module:Class; found 0.5"),
+        ({"link": {"kind": "constant"}}, "kind: expected one of radio, or package.module:Class; found 'constant'"),
+        ({"link": 0.5}, r"Input should be a valid string"),
         ({"link": {"kind": f"{HERE}:SentLists"}}, "is no kind of copem_replay.communication.link.LinkModel"),
     ],
 )
@@ -173,7 +172,7 @@ def test_constant_delays_by_unit_and_of_lists_that_are_not_heard() -> None:
     names = ("a", "b", "c")
     seen = type(log)(**{**vars_of(log), "units": names, "frame_unit_ix": np.arange(81) % 3})
     link = ConstantLink(latency_s={"a": 0.5, "default": 0.25})
-    found = transmit(seen, link, "link", {"a", "b"}).arrives_s - log.captured_s
+    found = transmit(seen, [UnitLinks("link", link)], {"a", "b"}).arrives_s - log.captured_s
     np.testing.assert_allclose(found, np.tile([0.5, 0.25, np.inf], 27)[None], atol=1e-12)
     assert [ConstantLink(latency_s={"a": 0.5}).fixed_s(name) for name in names] == [0.5, 0.0, 0.0]
 

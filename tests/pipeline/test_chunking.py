@@ -30,6 +30,7 @@ from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.chunking import Reach
 from copem_replay.pipeline.one_run import RunTracks
 from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.presence import Presence
 from copem_replay.pipeline.receiver import listen, seen_by_all
 from copem_replay.pipeline.run import Result, run
 from tests.helpers import scenes
@@ -38,6 +39,8 @@ from tests.helpers.scenes import Thing, driving, experiment, standing
 from tests.io import test_recorded_units as test_recorded
 from tests.viewer.test_rrd import rows
 
+ALL = Presence.same(np.ones(1, dtype=bool))
+"""There is one unit, and it is there."""
 LOGS = Path(__file__).parents[2] / "logs"
 
 
@@ -248,7 +251,7 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
     pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
     for replay in (whole.replays[0], pieces.replays[0]):
-        worlds = list(replay.worlds(plan, np.arange(1), None, measured_only=True))
+        worlds = list(replay.worlds(plan, np.arange(1), ALL, measured_only=True))
         assert {int(k) for world in worlds for k in world.found.tracks.row_object_ix} == pedestrians
 
 
@@ -323,7 +326,7 @@ def test_what_no_run_lists_is_not_held(rows_at_once: int, monkeypatch: pytest.Mo
     found = replay.found(WHOLE)
     listed = np.flatnonzero((found.view.range_m >= 0) & (found.view.range_m < 20))
     assert 0 < len(listed) < len(found.view.range_m) / 2
-    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), None)]
+    held = [set(world.found.view.range_m.tolist()) for world in replay.worlds(plan, np.arange(1), ALL)]
     assert set().union(*held) == set(found.view.range_m[listed].tolist())
 
 
@@ -376,7 +379,7 @@ def test_a_chunk_reaches_back_to_a_list_that_another_unit_still_goes_by() -> Non
     replay = prepare(traffic(), plan)
     lists = replay.lists_only(plan)
     seen = seen_by_all(lists, np.arange(1), states="true")
-    heard = {"ideal": listen(seen, lists.truth, lists.experiment, "ideal")}
+    heard = {"ideal": listen(seen, lists, "ideal")}
     assert Reach(plan, heard).earliest_s(TimeChunk(2.85, 3.0)) == pytest.approx(2.0, abs=0.01)
 
 

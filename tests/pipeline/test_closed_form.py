@@ -204,7 +204,7 @@ def by_detect(ready: Replay, plan: Experiment, name: str = "all") -> dict[str, T
         valid[:, chance] = outcomes
         weight = np.where(outcomes, probability[chance], 1 - probability[chance]).prod(axis=1)
         found = detect(
-            listen(replace(tracks, valid=valid), ready.truth, plan, name),
+            listen(replace(tracks, valid=valid), ready.world(plan), name),
             ready.episodes,
             confirm=plan.measure.confirm,
             count_earlier=plan.measure.count_earlier,

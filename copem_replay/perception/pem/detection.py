@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from copem_replay.core.components import Component, NotNegative, Share, asked, wrong
+from copem_replay.core.grid import bilinear, check_grid
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import ViewGeometry
 
@@ -76,37 +76,12 @@ class Table(DetectionModel):
 
     @model_validator(mode="after")
     def _shape(self) -> Self:
-        for name in ("range_m", "visible_share"):
-            axis = getattr(self, name)
-            if any(b <= a for a, b in pairwise(axis)):
-                raise ValueError(f"{name}: expected increasing values, found {list(axis)}")
-        expected = (len(self.range_m), len(self.visible_share))
-        widths = {len(row) for row in self.probability_}
-        if len(self.probability_) != expected[0] or widths != {expected[1]}:
-            raise ValueError(
-                f"probability: expected {expected[0]} rows (range_m) of {expected[1]} values (visible_share), "
-                f"found {len(self.probability_)} rows of {sorted(widths)}"
-            )
+        check_grid(("range_m", self.range_m), ("visible_share", self.visible_share), "probability", self.probability_)
         return self
 
     def probability(self, view: ViewGeometry) -> Float:
         """(P,) interpolated."""
-        table = np.array(self.probability_)
-        i, a = _place(np.array(self.range_m), view.range_m)
-        j, b = _place(np.array(self.visible_share), view.visible_share)
-        i1, j1 = np.minimum(i + 1, table.shape[0] - 1), np.minimum(j + 1, table.shape[1] - 1)
-        low = table[i, j] * (1 - b) + table[i, j1] * b
-        high = table[i1, j] * (1 - b) + table[i1, j1] * b
-        result: Float = low * (1 - a) + high * a
-        return result
-
-
-def _place(axis: Float, value: Float) -> tuple[np.ndarray, Float]:
-    """Cell (P,) and place within it (P,), 0 … 1, of values on an ascending axis; the ends hold beyond them."""
-    if len(axis) == 1:
-        return np.zeros(len(value), dtype=int), np.zeros(len(value))
-    cell = np.clip(np.searchsorted(axis, value, side="right") - 1, 0, len(axis) - 2)
-    return cell, np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)
+        return bilinear(self.range_m, self.visible_share, self.probability_, view.range_m, view.visible_share)
 
 
 DETECTION_MODELS = {

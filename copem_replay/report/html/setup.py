@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.components import Component
 from copem_replay.core.text import counted
+from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.io.window import in_words
 from copem_replay.report.html.markup import Html, table, tag
@@ -89,7 +90,7 @@ def configurations(study: Study) -> Html:
         cells = (
             _heard(configuration, units),
             "–" if truth else "its own" if configuration.recorded else _fusion(configuration),
-            "as recorded" if configuration.recorded else _latency(configuration, units),
+            "as recorded" if configuration.recorded else _way(experiment, configuration, units),
         )
         rows.append(
             tag(
@@ -123,16 +124,33 @@ def _component(component: Component) -> str:
     said = component.model_dump(mode="json", by_alias=True)
     kind = str(said.pop("kind"))
     plain = {key: field.get_default() for key, field in type(component).model_fields.items()}
+    of = {key: value for key in type(component).model_fields if isinstance(value := getattr(component, key), Component)}
+    said |= {key: _component(value) for key, value in of.items() if value != plain.get(key)}
+    plain |= {key: said[key] for key, value in of.items() if value == plain.get(key)}
     other = [f"{key}: {value}" for key, value in said.items() if value != plain.get(key)]
     return f"{kind} ({', '.join(other)})" if other else kind
 
 
+def _way(experiment: Experiment, configuration: Configuration, units: Sequence[str]) -> str:
+    """By which links lists come, and the latency; how often lists are issued."""
+    by: dict[str, list[str]] = {}
+    senders = units or (TRUTH,)
+    for unit in senders:
+        link = configuration.link_of(unit)
+        if isinstance(link, str):
+            by.setdefault(f"link {link} = {_component(experiment.links[link])}", []).append(unit)
+        elif link is not None:
+            by.setdefault(_component(link), []).append(unit)
+    links = [said if len(of) == len(senders) else f"{some(of)} by {said}" for said, of in by.items()]
+    late = [_latency(configuration, units)] if configuration.latency_s or not links else []
+    issued = [f"issued at {configuration.issue_hz:g} Hz"] if configuration.issue_hz is not None else []
+    return "; ".join([*links, *late, *issued])
+
+
 def _latency(configuration: Configuration, units: Sequence[str]) -> str:
-    if configuration.link is not None:
-        return _component(configuration.link)
     if not isinstance(configuration.latency_s, dict):
         return f"{configuration.latency_s:g} s"
     by: dict[float, list[str]] = {}
     for unit in units:
-        by.setdefault(configuration.latency_of(unit) or 0.0, []).append(unit)
+        by.setdefault(configuration.latency_of(unit), []).append(unit)
     return "; ".join(f"{some(of)} {latency_s:g} s" for latency_s, of in by.items())

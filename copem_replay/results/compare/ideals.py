@@ -30,6 +30,7 @@ def _is_ideal_over(said: dict[str, Any], inputs: object) -> bool:
         and {"kind": "ideal", "combine": "samples"} | fusion == {"kind": "ideal", "combine": "samples"}
         and not said.get("latency_s")
         and not said.get("link")
+        and not said.get("issue_hz")
     )
 
 
