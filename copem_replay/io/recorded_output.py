@@ -15,11 +15,12 @@ from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.io.config import RecordedOutput
 from copem_replay.io.plausibility import MAX_GAP_S
 from copem_replay.io.recorded_osi import RecordedLists
-from copem_replay.io.recorded_units import recorded_unit
+from copem_replay.io.recorded_units import beside_truth, recorded_unit
 from copem_replay.io.recording import Recording
 
 SAME_CLOCK_S = 60.0
 """Lists logged farther from their stamps were stamped by another clock (chosen: no stack takes so long)."""
+_PREDICTED = "by `tells_of` its states are of when it is available, a delay of 0"
 
 
 def recorded_output(
@@ -29,21 +30,30 @@ def recorded_output(
 
     Raises RecordingError as `recorded_unit`.
     """
-    found, notes = recorded_unit(recording, name, asked, gate_m=gate_m, max_gap_s=max_gap_s)
+    predicted = asked.tells_of == "available"
+    found, notes = recorded_unit(
+        recording, name, asked, gate_m=gate_m, max_gap_s=max_gap_s, called="configuration", held=not predicted
+    )
     stamp_ns = recording.scene.t0_ns + np.rint(found.tracks.common_arrives_s * 1e9).astype(np.int64)
     behind_ns = found.logged_ns - stamp_ns
     asks = ~found.capture_said & found.stamped
     away_s = float(np.median(behind_ns[asks])) * 1e-9 if asks.any() else 0.0
-    if abs(away_s) > SAME_CLOCK_S:
-        notes.append(
-            f"{name}: logged {away_s:.6g} s from its stamps, by another clock: its lists are taken as available at "
-            "their stamps, and its latency is not known"
-        )
-        return replace(found, stamped=np.zeros_like(found.stamped)), notes
+    other_clock = abs(away_s) > SAME_CLOCK_S
     early = int((asks & (behind_ns < -SAME_INSTANT_NS)).sum())
-    if early:
+    if other_clock:
+        notes.append(
+            f"configuration {name}: logged {away_s:.6g} s from its stamps, by another clock: its lists are taken as "
+            "available at their stamps, and its latency is not known"
+        )
+    elif early:
         said = counted(early, "list was logged before its stamp", "lists were logged before their stamps")
-        notes.append(f"{name}: {said}; taken as available then")
-    available_ns = np.where(asks, np.maximum(found.logged_ns, stamp_ns), stamp_ns)
+        notes.append(f"configuration {name}: {said}; taken as available then")
+    available_ns = stamp_ns if other_clock else np.where(asks, np.maximum(found.logged_ns, stamp_ns), stamp_ns)
     arrives_s = (available_ns - recording.scene.t0_ns) * np.float64(1e-9)
-    return replace(found, tracks=replace(found.tracks, arrives_s=arrives_s[None])), notes
+    stamped = found.stamped & (not other_clock)
+    if predicted:  # its states are of when it is available, whatever it says of captures
+        then = replace(found.tracks, stamp_ns=available_ns, captured_s=arrives_s)
+        shown = replace(found, tracks=then, capture_said=np.zeros_like(found.capture_said))
+        lines = beside_truth(recording, shown, then, _PREDICTED, 0.0, gate_m=gate_m, max_gap_s=max_gap_s)
+        notes += [f"configuration {name}: {line}" for line in lines]
+    return replace(found, tracks=replace(found.tracks, arrives_s=arrives_s[None]), stamped=stamped), notes

@@ -6,7 +6,7 @@ messages don't say of the covariance and of the existence comes from the experim
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -61,10 +61,18 @@ class RecordedUnits:
 
 
 def recorded_unit(
-    recording: Recording, name: str, asked: Recorded, *, gate_m: float = 3.0, max_gap_s: float = MAX_GAP_S
+    recording: Recording,
+    name: str,
+    asked: Recorded,
+    *,
+    gate_m: float = 3.0,
+    max_gap_s: float = MAX_GAP_S,
+    called: str = "unit",
+    held: bool = True,
 ) -> tuple[RecordedLists, list[str]]:
     """A unit's lists with all that is asked for, in the window and frames of the truth, and what has to be said.
 
+    `called`: what it is in notes. `held`: whether what is odd about it is told by the truth, too.
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
     path, scene, window = recording.path, recording.scene, recording.window
@@ -81,7 +89,8 @@ def recorded_unit(
             path=path,
             topic=asked.topic,
         )
-    notes = [f"unit {name}: {found.dropped} of its entries have no position and are left out"] if found.dropped else []
+    me = f"{called} {name}"
+    notes = [f"{me}: {found.dropped} of its entries have no position and are left out"] if found.dropped else []
     columns: dict[str, Any] = {}
     if asked.covariance_m2 is not None:
         (ee, en), (_, nn) = asked.covariance_m2
@@ -93,20 +102,36 @@ def recorded_unit(
     early = int((tracks.stamp_ns > arrives_ns + SAME_INSTANT_NS).sum())
     if early:
         said = counted(early, "list says it was", "lists say they were")
-        notes.append(f"unit {name}: {said} captured after arriving; taken as captured then")
+        notes.append(f"{me}: {said} captured after arriving; taken as captured then")
     tracks = replace(
         tracks, units=(name,), stamp_ns=stamp_ns, captured_s=(stamp_ns - scene.t0_ns) * np.float64(1e-9), **columns
     )
-    if not found.capture_said.all():
-        delay = delay_of(found, scene, recording.truth)
-        if delay.untold is None and not delay.low_s <= asked.delay_s <= delay.high_s:
-            notes.append(
-                f"unit {name}: delay_s is {asked.delay_s:g}, but its entries fit the truth at {delay_words(delay)}"
-            )
-    told = with_truth_ids(replace(found, tracks=tracks), scene, recording.truth, gate_m=gate_m, max_gap_s=max_gap_s)
-    notes += [f"unit {name}: {line}" for line in odd_about(found, told.row_object_ix, scene)]
+    if held:
+        said = f"delay_s is {asked.delay_s:g}"
+        lines = beside_truth(recording, found, tracks, said, asked.delay_s, gate_m=gate_m, max_gap_s=max_gap_s)
+        notes += [f"{me}: {line}" for line in lines]
     existence = np.where(np.isnan(found.existence), asked.existence, found.existence)
     return replace(found, tracks=tracks, existence=np.clip(existence, 0.0, 1.0)), notes
+
+
+def beside_truth(
+    recording: Recording,
+    found: RecordedLists,
+    tracks: Tracks,
+    said: str,
+    delay_s: float,
+    *,
+    gate_m: float,
+    max_gap_s: float,
+) -> Iterator[str]:
+    """A delay that the truth belies, and oddities. `found`: by its stamps; `tracks`: when states are `said` to be."""
+    scene, truth = recording.scene, recording.truth
+    if not found.capture_said.all():
+        delay = delay_of(found, scene, truth)
+        if delay.untold is None and not delay.low_s <= delay_s <= delay.high_s:
+            yield f"{said}, but its entries fit the truth at {delay_words(delay)}"
+    told = with_truth_ids(replace(found, tracks=tracks), scene, truth, gate_m=gate_m, max_gap_s=max_gap_s)
+    yield from odd_about(found, told.row_object_ix, scene)
 
 
 def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float) -> Tracks:

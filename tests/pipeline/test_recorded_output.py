@@ -128,6 +128,33 @@ class TestWhatAnEntryTellsOf:
             assert row(result)["position_rmse_m"] == pytest.approx(4.0 if tells_of == "stamp" else 0.0)
             assert row(result)["position_rmse_captured_m"] == pytest.approx(0.0)
 
+    @pytest.mark.parametrize(
+        ("tells_of", "late_s", "said"),
+        [
+            ("available", 0.0, None),
+            ("available", 0.17, "by `tells_of` its states are of when it is available, a delay of 0, but its entries"),
+            ("stamp", 0.0, "delay_s is 0, but its entries fit the truth at -0.17"),
+            ("stamp", 0.17, None),
+        ],
+    )
+    def test_what_predicts_is_not_late(self, tmp_path: Path, tells_of: str, late_s: float, said: str | None) -> None:
+        """States of when a list is available, .17 s after its stamp, or `late_s` before then, of a car that brakes."""
+
+        def at(t: float) -> tuple[float, float]:
+            return 30 + 12 * t + 4 * np.sin(t), 12 + 4 * np.cos(t)
+
+        frames = [(k / 10, [Obj(id=1), Obj(id=2, x=at(k / 10)[0], vx=at(k / 10)[1])]) for k in range(200)]
+        lists = []
+        for t in np.arange(0.3, 19.0, 0.1).tolist():
+            x_m, speed_mps = at(t + 0.17 - late_s)
+            lists.append(logged(t + 0.17, list_of(t, car(x_m, vx=speed_mps))))
+        stack = Topic("stack", "osi3.SensorData", lists)
+        path = write_recording(tmp_path / "a.mcap", frames, host=1, more=[stack])
+        recording, _ = replayed(plan(path, inputs=None, output={"tells_of": tells_of}))
+        notes = [note for note in recording.notes if "but its entries" in note]
+        assert len(notes) == (said is not None)
+        assert all(note.startswith(f"configuration stack: {said}") for note in notes)
+
 
 class TestMeasured:
     def test_as_union_of_the_same_lists(self, tmp_path: Path) -> None:
