@@ -42,7 +42,7 @@ def info(
     else:
         say_blocks(describe(s, width_of(sys.stdout)) for s in surveys if s.topics)
     complain(s.reason for s in surveys if s.reason is not None)
-    return 0 if any(s.readable for s in surveys) else 2
+    return 0 if any(s.readable or any(u.problem is None for u in s.units) for s in surveys) else 2
 
 
 def _clocks(logs: Sequence[Path]) -> int:

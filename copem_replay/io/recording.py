@@ -185,9 +185,11 @@ def choose_topic(
             )
         return topic, _ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
     if not topics:
+        units = any(c.messages and (c.schema == osi.SENSOR_DATA or is_list(c)) for c in log.channels)
         raise RecordingError(
             f"no list of true objects; it holds {_listed(log.channels)}; "
-            "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)",
+            + "beside a recording that has one its lists replay by `together: [THAT, THIS]`; " * units
+            + "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)",
             path=log.path,
         )
     if topic is not None and topic not in topics:

@@ -7,7 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from copem_replay.cli.main import app
 from copem_replay.experiment.draft.findings import as_json
 from copem_replay.experiment.draft.survey import survey
 from copem_replay.experiment.draft.survey_text import describe
@@ -32,7 +34,7 @@ configurations:
   coPEM: {units: [ego, rsu]}
 measure: {objects: {classes: [vru]}}
 """
-RSU = Topic("rsu", "osi3.SensorData", [(0, b""), (1, b"")])
+RSU = Topic("rsu", "osi3.SensorData", [(0, b""), (250_000_000, b"")])
 ODOMETRY = Topic("/odom", "nav_msgs/msg/Odometry", [(0, b"x")], "cdr")
 
 
@@ -94,6 +96,7 @@ def test_survey(path):
                         "topic": "rsu",
                         "lists": 2,
                         "entries": 0,
+                        "rate_hz": 4.0,
                         "covariances_said": True,
                         "captures_said": False,
                         "problem": None,
@@ -117,6 +120,7 @@ def test_survey(path):
         ],
         "log": str(path),
         "experiment": EXPERIMENT.replace("LOG", str(path)),
+        "units": [],
     }
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert as_json(survey(path)) == found
@@ -137,7 +141,7 @@ def test_describe(path):
         "  moving: 1 pedestrian, 1 car",
         "  stationary: 1 other",
         "  ego: 4 (car, 4.50 × 2.00 × 1.50 m), 0.000 – 1.500 s",
-        "  unit rsu: 2 lists, 0 entries; says not when captured",
+        "  unit rsu: 2 lists, 0 entries, 4.00 Hz (median); says not when captured",
         "    delay_s against the truth cannot be told: nothing in them can be followed from list to list",
         "  note: 1 message of nav_msgs/msg/Odometry not read",
         f"experiment; with comments: copem-replay init {path} > experiment.yaml",
@@ -203,14 +207,27 @@ def test_no_truth_says_what_there_is(path):
     reason = found.reason
     assert reason == (
         f"{path}: no list of true objects; it holds nav_msgs/msg/Odometry (cdr) on /odom, osi3.SensorData on rsu; "
-        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)"
+        "beside a recording that has one its lists replay by `together: [THAT, THIS]`; "
+        "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/recordings.md)"
     )
     assert describe(found) == [
         "log.mcap",
         "  topic  schema                 encoding  messages",
         "  /odom  nav_msgs/msg/Odometry  cdr              1  poses",
         "  rsu    osi3.SensorData        protobuf         2  lists of a unit, for `recorded: {topic: …}`",
+        "unit rsu: 2 lists, 0 entries, 4.00 Hz (median); says not when captured",
     ]
+
+
+def test_info_of_a_bag_of_lists_alone_is_no_error(path):
+    write_mcap(path, [RSU])
+    ended = CliRunner().invoke(app, ["info", str(path)], standalone_mode=False)
+    assert ended.return_value == 0
+    assert "unit rsu: 2 lists" in ended.output
+    write_mcap(path, [Topic("rsu", "osi3.SensorData", [(0, b"\xff")])])
+    ended = CliRunner().invoke(app, ["info", str(path)], standalone_mode=False)
+    assert ended.return_value == 2
+    assert "unit rsu: a message cannot be decoded" in ended.output
 
 
 def test_every_topic_has_a_role(path):

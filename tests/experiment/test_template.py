@@ -221,10 +221,23 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
     assert recorded == {
         "rsu": {"topic": "mcity.RSU.SensorData", "delay_s": 0.0, "covariance_m2": [[0.5, 0.0], [0.0, 0.5]]},
         "front": {"topic": "/obu/front objects"},
-        "ego2": {"topic": "ego/objects"},
+        "ego_recorded": {"topic": "ego/objects"},
     }
+    assert experiment["configurations"]["recorded"]["units"] == ["rsu", "front", "ego_recorded"]
+    assert "with ego_recorded" not in experiment["configurations"]
     assert experiment["configurations"]["with rsu"] == {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}
     assert "  # broken cannot be a unit: " in commented(survey("log.mcap"))
+
+
+def test_what_a_stack_made_of_lists_is_no_unit_beside_them(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    output = unit("/fusion/objects", covariance=True, captured=True)
+    write_recording(tmp_path / "log.mcap", street(), host=1, more=[unit("rsu"), output])
+    experiment = replayed("log.mcap")
+    assert "recorded" not in experiment["units"]["roadside"]
+    assert "fusion" not in experiment["units"]
+    assert experiment["configurations"]["fusion"] == {"recorded": {"topic": "/fusion/objects"}, "inputs": ["rsu"]}
+    write_recording(tmp_path / "log.mcap", street(), host=1, more=[output])  # of nothing else: who knows
+    assert replayed("log.mcap")["units"]["fusion"] == {"recorded": {"topic": "/fusion/objects"}}
 
 
 # What other writers have, as JSON: no definition is needed to write it

@@ -139,23 +139,29 @@ def test_labels_are_as_long_as_they_need_to_be(tmp_path: Path) -> None:
     assert labels_of([tmp_path / "a/x.mcap", tmp_path / "b/x.mcap"]) == ["a/x", "b/x"]
 
 
-def traffic(folder: Path, ahead_s: float) -> tuple[Path, Path]:
-    """Two cars at varying speeds by the truth, and by a unit with errors of half a metre and a clock of its own."""
+def traffic(folder: Path, ahead_s: float, *, captured: bool = False, truth: bool = True) -> tuple[Path, Path]:
+    """Two cars at varying speeds by the truth, and by a unit with errors of half a metre and a clock of its own.
+
+    `captured`: the unit says when its lists were captured; the vehicle's bag has them, too, 0.2 s late and unsaid.
+    """
     rng = np.random.default_rng(2)
 
     def along(t: float) -> tuple[float, float]:
         return 8 * t - 4 * np.cos(t), 8 + 4 * np.sin(t)
 
-    frames, lists = [], []
+    frames, lists, late = [], [], []
     for k in range(400):
         x, v = along(0.05 * k)
         frames.append((100 + 0.05 * k, [Obj(id=1, x=x, vx=v), Obj(id=2, x=-x, y=9, vx=-v)]))
     for k in range(3, 180):
         x, v = along(0.1 * k)
         east, north = rng.normal(0, 0.5, (2, 2))
-        entries = car(x + east[0], north[0], vx=v), car(-x + east[1], 9 + north[1], vx=-v)
-        lists.append(list_of(100 + 0.1 * k + ahead_s, *entries))
-    ego = write_mcap(folder / "ego.mcap", [truth_topic(frames, name="truth", host=1)])
+        entries = car(x + east[0], north[0], vx=v), car(-x + east[1], 9 + north[1], vx=-v, track=1)
+        stamp_s = 100 + 0.1 * k + ahead_s
+        lists.append(list_of(stamp_s, *entries, captured_s=stamp_s if captured else None))
+        late.append(list_of(stamp_s - ahead_s + 0.2, *entries))
+    topics = [truth_topic(frames, name="truth", host=1)] if truth else []
+    ego = write_mcap(folder / "ego.mcap", [*topics, *[Topic("stack", "osi3.SensorData", late)] * captured])
     return ego, write_mcap(folder / "rsu.mcap", [Topic("objects", "osi3.SensorData", lists)])
 
 
@@ -175,6 +181,17 @@ class TestClocks:
         (study,) = cr.load_experiment(tmp_path / "experiment.yaml").logs
         assert not isinstance(study, str)
         assert study.together == tuple(logs)
+
+    def test_lists_of_an_unknown_delay_come_last_however_narrow_their_interval(self, tmp_path: Path) -> None:
+        (found,) = clocks(traffic(tmp_path, 0.3, captured=True))
+        assert found.lists == ("ego:truth", "rsu:objects")
+        assert found.offset.offset_s == pytest.approx(0.3, abs=0.03)
+        assert "included" not in found.words()
+
+    def test_a_delay_that_is_in_the_offset_is_said(self, tmp_path: Path) -> None:
+        (found,) = clocks(traffic(tmp_path, 0.3, captured=True, truth=False))
+        assert found.offset.offset_s == pytest.approx(0.3 - 0.2, abs=0.01)
+        assert found.words().endswith(", the delay of ego:stack included, which does not say when captured")
 
     def test_one_recording_has_nothing_to_be_ahead_of(self, folder: Path) -> None:
         found = CliRunner().invoke(app, ["info", str(folder / "ego.mcap"), "--together"], standalone_mode=False)

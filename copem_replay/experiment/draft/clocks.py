@@ -26,11 +26,15 @@ _OURS = "copem/"  # what this project wrote beside a recording
 
 @dataclass(frozen=True)
 class ClockFound:
-    """What is told of the clock of a recording against the first one's: by which two lists; `offset`: the best."""
+    """What is told of the clock of a recording against the first one's: by which two lists; `offset`: the best.
+
+    `late`: which of the two do not say when they were captured, so that their delay is in the offset.
+    """
 
     path: Path
     lists: tuple[str, str]
     offset: TimeOffset
+    late: tuple[str, ...] = ()
 
     def words(self) -> str:
         """`0.130 s (95 %: 0.120 … 0.140 s)` and the drift, or that it cannot be told."""
@@ -43,6 +47,9 @@ class ClockFound:
         if found.drift is not None:
             drift, low, high = (1e6 * value for value in found.drift)
             said += f", drift {drift:.0f} µs/s (95 %: {low:.0f} … {high:.0f})"
+        if self.late:
+            do = "does" if len(self.late) == 1 else "do"
+            said += f", the delay of {' and '.join(self.late)} included, which {do} not say when captured"
         return said
 
 
@@ -50,6 +57,7 @@ class ClockFound:
 class _Lists:
     name: str
     entries: Entries
+    captures_said: bool = True  # of the truth, too
 
 
 def clocks(paths: Sequence[Path]) -> list[ClockFound]:
@@ -67,9 +75,19 @@ def clocks(paths: Sequence[Path]) -> list[ClockFound]:
 
 
 def _best(path: Path, first: Sequence[_Lists], mine: Sequence[_Lists]) -> ClockFound:
-    """What the two lists tell whose interval is narrowest."""
-    found = [ClockFound(path, (a.name, b.name), time_offset(a.entries, b.entries)) for a, b in product(first, mine)]
-    return min(found, key=lambda one: (one.offset.untold is not None, one.offset.high_s - one.offset.low_s))
+    """What the two lists tell whose interval is narrowest, of those with the fewest unknown delays."""
+    found = [
+        ClockFound(
+            path,
+            (a.name, b.name),
+            time_offset(a.entries, b.entries),
+            tuple(one.name for one in (a, b) if not one.captures_said),
+        )
+        for a, b in product(first, mine)
+    ]
+    return min(
+        found, key=lambda one: (one.offset.untold is not None, len(one.late), one.offset.high_s - one.offset.low_s)
+    )
 
 
 def _lists(log: Log, label: str, t0_ns: int) -> Iterator[_Lists]:
@@ -80,7 +98,7 @@ def _lists(log: Log, label: str, t0_ns: int) -> Iterator[_Lists]:
         except RecordingError:
             continue
         yield _Lists(f"{label}:{topic}", entries_of(truth, t0_ns))
-    scene = Scene(label, t0_ns, log.end_ns, (), np.empty(0, dtype=np.int8), np.empty(0, dtype=bool))
+    scene = without_objects(label, t0_ns, log.end_ns)
     osis = [c.topic for c in log.channels if c.schema == "osi3.SensorData" and c.messages]
     others = [c.topic for c in known_lists(log.channels) if c.messages and c.topic not in truth_topics(log)]
     for topic in dict.fromkeys([*osis, *others]):
@@ -90,4 +108,10 @@ def _lists(log: Log, label: str, t0_ns: int) -> Iterator[_Lists]:
         except RecordingError:
             continue
         if not topic.startswith(_OURS) and len(found.tracks.frame_ix):
-            yield _Lists(f"{label}:{topic}", entries_of(found.tracks, t0_ns, found.track_id))
+            entries = entries_of(found.tracks, t0_ns, found.track_id)
+            yield _Lists(f"{label}:{topic}", entries, bool(found.capture_said.all()))
+
+
+def without_objects(name: str, t0_ns: int, end_ns: int) -> Scene:
+    """A log of which no truth is known."""
+    return Scene(name, t0_ns, end_ns, (), np.empty(0, dtype=np.int8), np.empty(0, dtype=bool))

@@ -26,6 +26,7 @@ class UnitFound:
     topic: str
     lists: int = 0
     entries: int = 0
+    rate_hz: float | None = None  # median
     covariances_said: bool = False  # by every entry
     captures_said: bool = False  # by every list
     problem: str | None = None
@@ -122,7 +123,8 @@ class Survey:
     `readable`: whether a list of true objects could be read; if not, `reason` says why in a line, and `topics` what
     the file holds all the same. `truth` has an entry per topic that could be the truth: one, unless there is a choice
     to make (then `choice` says so). `damage`: what is wrong with the file. `experiment`: to begin with. `proposals`:
-    where no list is known by name, what could be read by naming fields.
+    where no list is known by name, what could be read by naming fields. `units`: lists of units, where
+    there is no truth to hold them against.
     """
 
     recording: str
@@ -135,6 +137,7 @@ class Survey:
     log: str = ""
     experiment: str | None = None
     proposals: list[ProposalFound] = field(default_factory=list)
+    units: list[UnitFound] = field(default_factory=list)
 
 
 def as_json(survey: Survey) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from copem_replay.io.together import Place, first_of
 if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
     from copem_replay.io.recorded_osi import RecordedLists
     from copem_replay.io.schemas.description import Fields
+    from copem_replay.io.world_frame import LogContext
 
 GATE_M = 3.0
 """Farther from a true object an entry is about no object: the default of `measure.match`."""
@@ -58,7 +59,8 @@ def survey(place: Place | str) -> Survey:
     except RecordingError as error:
         topics = list(truth_topics(log))
         if not topics:
-            return replace(found, reason=str(error), proposals=_proposals(log, found.topics))
+            units = list(_units_alone(log, place, found.topics))
+            return replace(found, reason=str(error), proposals=_proposals(log, found.topics), units=units)
         found = replace(found, choice=str(error))
     truth, failures = [], []
     beside = [t.topic for t in found.topics if t.role == "unit"]
@@ -96,24 +98,46 @@ def _topics(log: Log) -> list[TopicFound]:
 
 def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
     """The lists of each unit, or what is wrong with them: `problem`."""
-    osis = {c.topic for c in log.channels if c.schema == osi.SENSOR_DATA}
+    osis = _osi_lists(log)
     for topic in dict.fromkeys(topics):
         try:
-            found = _lists(recording, topic, of_osi=topic in osis)
+            found = _lists(recording.place, topic, recording.scene, recording.around, of_osi=topic in osis)
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
             continue
-        lists = len(found.tracks.stamp_ns)
-        known = _against_truth(recording, found) if lists else {}
-        yield UnitFound(
-            topic,
-            lists=lists,
-            entries=len(found.tracks.frame_ix),
-            covariances_said=bool(found.spread_said.all()),
-            captures_said=bool(found.capture_said.all()),
-            problem=None if lists else "holds no list",
-            **known,
-        )
+        yield _unit(topic, found, _against_truth(recording, found) if len(found.tracks.stamp_ns) else {})
+
+
+def _units_alone(log: Log, place: Place, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
+    """The lists of each unit of a recording without truth, as far as they can be read without one."""
+    from copem_replay.experiment.draft.clocks import without_objects
+
+    osis, scene = _osi_lists(log), without_objects(log.path.stem, log.start_ns, log.end_ns)
+    for topic in dict.fromkeys(t.topic for t in topics if t.role == "unit" and t.messages):
+        try:
+            yield _unit(topic, _lists(place, topic, scene, None, of_osi=topic in osis), {})
+        except RecordingError as error:
+            yield UnitFound(topic, problem="; ".join(error.within(log.path, topic)))
+
+
+def _unit(topic: str, found: RecordedLists, known: dict[str, Any]) -> UnitFound:
+    """What the lists say of themselves, and what is known of them by the truth."""
+    between_s = np.diff(np.unique(found.tracks.stamp_ns)) * 1e-9
+    lists = len(found.tracks.stamp_ns)
+    return UnitFound(
+        topic,
+        lists=lists,
+        entries=len(found.tracks.frame_ix),
+        rate_hz=round(1.0 / float(np.median(between_s)), 3) if len(between_s) else None,
+        covariances_said=bool(found.spread_said.all()),
+        captures_said=bool(found.capture_said.all()),
+        problem=None if lists else "holds no list",
+        **known,
+    )
+
+
+def _osi_lists(log: Log) -> set[str]:
+    return {c.topic for c in log.channels if c.schema == osi.SENSOR_DATA}
 
 
 def _against_truth(recording: Recording, found: RecordedLists) -> dict[str, Any]:
@@ -133,17 +157,17 @@ def _against_truth(recording: Recording, found: RecordedLists) -> dict[str, Any]
     return known | {"oddities": list(odd_about(found, told.row_object_ix, scene))}
 
 
-def _lists(recording: Recording, topic: str, *, of_osi: bool) -> RecordedLists:
+def _lists(place: Place, topic: str, scene: Scene, around: LogContext | None, *, of_osi: bool) -> RecordedLists:
     """As a recorded unit has them. Raises RecordingError."""
     if of_osi:
         from copem_replay.io.recorded_osi import read_recorded
 
-        return read_recorded(recording.place, topic, recording.scene)
+        return read_recorded(place, topic, scene)
     from copem_replay.io.recorded_lists import read_listed
 
-    found = read_listed(recording.place, topic, recording.scene, recording.around)
+    found = read_listed(place, topic, scene, around)
     if found is None:
-        raise RecordingError("holds no list", path=recording.path, topic=topic)
+        raise RecordingError("holds no list", path=first_of(place), topic=topic)
     return found
 
 

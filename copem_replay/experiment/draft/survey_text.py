@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from copem_replay.core.text import counted, printable
-from copem_replay.experiment.draft.findings import Role, Survey, TopicFound, TruthFound
+from copem_replay.experiment.draft.findings import Role, Survey, TopicFound, TruthFound, UnitFound
 from copem_replay.experiment.draft.template import read_block
 from copem_replay.io.plausibility import MAX_GAP_S
 
@@ -27,6 +27,7 @@ def describe(survey: Survey, width: int | None = None) -> list[str]:
     lines: list[str] = [survey.recording, *_topic_lines(survey, width)]
     for truth in survey.truth:
         lines += _truth_lines(truth)
+    lines += [line for unit in survey.units for line in _unit_lines(unit)]
     lines += [survey.choice] if survey.choice else []
     for proposal in survey.proposals:
         lines.append(f"{proposal.topic} may be read as a list of objects, by the names of its fields:")
@@ -89,15 +90,20 @@ def _truth_lines(truth: TruthFound) -> list[str]:
         size = " × ".join(f"{side:.2f}" for side in ego.size_m)
         lines.append(f"  ego: {ego.id} ({ego.class_}, {size} m), {ego.from_s:.3f} – {ego.to_s:.3f} s")
     for unit in truth.units:
-        if unit.problem:
-            lines.append(f"  unit {unit.topic}: {unit.problem}")
-            continue
-        unsaid = [] if unit.covariances_said else ["no covariances"]
-        unsaid += [] if unit.captures_said else ["not when captured"]
-        said = f"{counted(unit.lists, 'list')}, {counted(unit.entries, 'entry', 'entries')}"
-        lines.append(f"  unit {unit.topic}: {said}" + (f"; says {' and '.join(unsaid)}" if unsaid else ""))
-        if unit.delay is not None:
-            lines.append(f"    delay_s against the truth {'' if unit.delay_s is None else 'is '}{unit.delay}")
-        lines += [f"    {line}" for line in unit.oddities]
+        lines += [f"  {line}" for line in _unit_lines(unit)]
     lines += [f"  missing: {line}" for line in truth.missing]
     return lines + [f"  note: {line}" for line in truth.notes]
+
+
+def _unit_lines(unit: UnitFound) -> list[str]:
+    """The lists of one unit."""
+    if unit.problem:
+        return [f"unit {unit.topic}: {unit.problem}"]
+    unsaid = [] if unit.covariances_said else ["no covariances"]
+    unsaid += [] if unit.captures_said else ["not when captured"]
+    said = f"{counted(unit.lists, 'list')}, {counted(unit.entries, 'entry', 'entries')}"
+    said += f", {unit.rate_hz:.2f} Hz (median)" if unit.rate_hz is not None else ""
+    lines = [f"unit {unit.topic}: {said}" + (f"; says {' and '.join(unsaid)}" if unsaid else "")]
+    if unit.delay is not None:
+        lines.append(f"  delay_s against the truth {'' if unit.delay_s is None else 'is '}{unit.delay}")
+    return lines + [f"  {line}" for line in unit.oddities]

@@ -17,6 +17,8 @@ _PLAIN = re.compile(r"(?:[A-Za-z_/]|\.{1,2}/)(?:[A-Za-z0-9_./-]*[A-Za-z0-9_/])?"
 _WORDS = ("null", "true", "false")
 _UNIT = "[[0.5, 0.0], [0.0, 0.5]]"
 _GENERIC = {"objects", "object", "sensordata", "detections", "tracks", "lists", "list", "markers", "data", "msg"}
+_FUSED = {"fusion", "fused", "stack"}
+"""Words in the topic of what a stack makes of the lists of others."""
 _OTHERS = 6  # topics named in a comment (chosen)
 
 
@@ -29,7 +31,8 @@ def short(survey: Survey) -> list[str]:
     """The experiment in as few lines as show its parts."""
     truth = main_truth(survey)
     guess = truth.suggested
-    ego, recorded = guess.ego != "none", _recorded(truth)[:1]
+    ego = guess.ego != "none"
+    recorded = [one for one in _recorded(truth)[0] if not (ego and _of_ego(one[0]))][:1]
     masts = [] if ego and recorded else guess.masts[:1]
     lines = ["version: 1", f"logs: [{quoted(survey.log)}]"]
     lines += [f"read: {{topic: {quoted(truth.topic)}}}"] if survey.choice else []
@@ -57,7 +60,7 @@ def commented(survey: Survey) -> str:
     """The experiment with a word on each key; it runs as it is."""
     truth = main_truth(survey)
     guess = truth.suggested
-    recorded = _recorded(truth)
+    recorded, outputs = _recorded(truth)
     ego = guess.ego != "none"
     first = ["ego", "roadside"] if ego else ["roadside", "across"]
     lines = [
@@ -84,6 +87,7 @@ def commented(survey: Survey) -> str:
         "",
         "configurations:",
         *_configurations(first, [name for name, _ in recorded], ego=ego),
+        *_outputs(outputs, [name for name, _ in recorded]),
         "",
         *_measure(guess, ego=ego),
         "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
@@ -228,10 +232,27 @@ def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool)
     ]  # fmt: skip
     for name in recorded:
         rows.append((name, f"{{units: [{name}], fusion: {{kind: gnn}}}}", "as it was recorded"))
-        rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], fusion: {{kind: gnn}}}}", "and together"))
+        if not (ego and _of_ego(name)):  # else the ego twice, as recorded and as modelled
+            rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], fusion: {{kind: gnn}}}}", "and together"))
+    if len(recorded) > 1:
+        rows.append(("recorded", f"{{units: [{', '.join(recorded)}], fusion: {{kind: gnn}}}}", "all of them"))
     width = max(len(name) for name, _, _ in rows) + 1
     for name, value, what in rows:
         yield f"  {name + ':':<{width}} {value}   # {what}"
+
+
+def _of_ego(name: str) -> bool:
+    """Whether lists are the ego's own, by their name."""
+    return name.startswith("ego")
+
+
+def _outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[str]) -> Iterator[str]:
+    """What a stack made of the lists, by the names of topics: measured like a fusion."""
+    for name, unit in outputs:
+        yield "  # By its name a stack's own output, and what it had; else it is a unit like the others"
+        yield from (f"  # {_plain(line)}" for line in unit.oddities)
+        late = "" if unit.delay is None else f"   # delay_s {_plain(unit.delay)}"
+        yield f"  {name}: {{recorded: {_recorded_value(unit)}, inputs: [{', '.join(recorded)}]}}{late}"
 
 
 def _measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
@@ -251,20 +272,22 @@ def _measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
 
 
-def _recorded(truth: TruthFound) -> list[tuple[str, UnitFound]]:
-    """The unit lists that could be read, by names that say which."""
+def _recorded(truth: TruthFound) -> tuple[list[tuple[str, UnitFound]], list[tuple[str, UnitFound]]]:
+    """The lists that could be read, by names that say which: of units, and of what a stack made of them."""
     named: dict[str, UnitFound] = {}
-    taken = {"ego", "roadside", "across", "others", "default", "truth", "all", "gt", "pem", "copem", "gnn"}
+    taken = {"ego", "roadside", "across", "others", "default", "truth", "all", "gt", "pem", "copem", "gnn", "recorded"}
     for unit in truth.units:
         if unit.problem:
             continue
         words = [word for word in re.split(r"[^a-z0-9]+", unit.topic.lower()) if word]
         telling = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
-        stem = telling[-1] if telling else "recorded"
-        tries = [stem, *(f"{stem}{k}" for k in range(2, len(truth.units) + 3))]
+        stem = telling[-1] if telling else "lists"
+        tries = [stem, *([f"{stem}_recorded"] if stem in taken else []), *(f"{stem}{k}" for k in range(2, 99))]
         name = next(name for name in tries if name not in taken and name not in named)
         named[name] = unit
-    return list(named.items())
+    fused = {name for name, unit in named.items() if _FUSED & set(re.split(r"[^a-z0-9]+", unit.topic.lower()))}
+    fused = fused if len(fused) < len(named) else set()
+    return [one for one in named.items() if one[0] not in fused], [one for one in named.items() if one[0] in fused]
 
 
 def _recorded_value(unit: UnitFound) -> str:
