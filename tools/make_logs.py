@@ -2,6 +2,7 @@
 
     python tools/make_logs.py [tc016d …] [--out logs]
     python tools/make_logs.py --long --out FOLDER [--minutes 60] [--objects 100]
+    python tools/make_logs.py --bags --out FOLDER                  # the two bags of docs/study.md
 
 A recording is an OSI multi-channel trace (MCAP). A further one is a function that returns an `OsiTrace`, in a
 module beside this one, say, and an entry in `recipes`. Axes in metres: x along the road, y to its left, z up.
@@ -195,11 +196,17 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(recipes())}; none: all")
     parser.add_argument("--out", type=Path, default=logs, help="folder (default: the project's logs/)")
     parser.add_argument("--long", action="store_true", help="only the long drive, city.mcap; it is not committed")
+    parser.add_argument("--bags", action="store_true", help="only the bags of docs/study.md; they are not committed")
     parser.add_argument("--minutes", type=float, default=60.0, help="how long the long drive is (default: 60)")
     parser.add_argument("--objects", type=int, default=100, help="how many there are at a time (default: 100)")
     arguments = parser.parse_args()
     if arguments.long:
         write_osi_trace(long_drive(arguments.minutes, arguments.objects), arguments.out / "city.mcap")
+        return
+    if arguments.bags:
+        from study_bags import write_bags
+
+        write_bags(arguments.out)
         return
     if unknown := set(arguments.names) - set(recipes()):
         parser.error(f"no recipe for {', '.join(sorted(unknown))}; there are: {', '.join(recipes())}")

@@ -31,6 +31,7 @@ class OsiTrace:
     messages: Iterable[tuple[str, Any]]  # (topic, message), in the order of their `timestamp`
     source: str  # where the content comes from
     records: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # further metadata; taken after the messages
+    logged_after_ns: Mapping[str, int] = field(default_factory=dict)  # by topic: after the stamp; left out: at it
 
 
 def empty_ground_truth(stamp_ns: int, host_id: int | None) -> GroundTruth:
@@ -77,6 +78,7 @@ def _write_content(writer: Writer, trace: OsiTrace) -> None:
             channel_ids[topic] = writer.register_channel(topic, "protobuf", schema_ids[schema], metadata)
         stamp_ns = message.timestamp.seconds * NANOS_PER_SECOND + message.timestamp.nanos
         data = message.SerializeToString(deterministic=True)
-        writer.add_message(channel_ids[topic], stamp_ns, data, publish_time=stamp_ns)
+        logged_ns = stamp_ns + trace.logged_after_ns.get(topic, 0)
+        writer.add_message(channel_ids[topic], logged_ns, data, publish_time=stamp_ns)
     for name, record in sorted(trace.records.items()):
         writer.add_metadata(name, dict(sorted(record.items())))
