@@ -2,7 +2,7 @@
 
     python tools/make_logs.py [tc016d …] [--out logs]
     python tools/make_logs.py --long --out FOLDER [--minutes 60] [--objects 100]
-    python tools/make_logs.py --bags --out FOLDER                  # the two bags of docs/study.md
+    python tools/make_logs.py --bags --out FOLDER                  # the two bags of docs/guide/study.md
 
 A recording is an OSI multi-channel trace (MCAP). A further one is a function that returns an `OsiTrace`, in a
 module beside this one, say, and an entry in `recipes`. Axes in metres: x along the road, y to its left, z up.
@@ -196,7 +196,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(recipes())}; none: all")
     parser.add_argument("--out", type=Path, default=logs, help="folder (default: the project's logs/)")
     parser.add_argument("--long", action="store_true", help="only the long drive, city.mcap; it is not committed")
-    parser.add_argument("--bags", action="store_true", help="only the bags of docs/study.md; they are not committed")
+    parser.add_argument("--bags", action="store_true", help="only the bags of docs/guide/study.md; they are not committed")
     parser.add_argument("--minutes", type=float, default=60.0, help="how long the long drive is (default: 60)")
     parser.add_argument("--objects", type=int, default=100, help="how many there are at a time (default: 100)")
     arguments = parser.parse_args()

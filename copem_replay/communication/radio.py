@@ -1,4 +1,4 @@
-"""A radio link: how long a list takes, whether it is lost, and what holds it up. docs/links.md."""
+"""A radio link: how long a list takes, whether it is lost, and what holds it up. docs/guide/links.md."""
 
 from __future__ import annotations
 

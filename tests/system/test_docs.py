@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -83,6 +85,44 @@ def test_pages_show_what_their_commands_print(
 def test_all_outputs_on_pages_are_tested() -> None:
     marked = [page for page in PAGES if "<!-- output: " in page.read_text(encoding="utf-8")]
     assert sorted(page.name for page in marked) == ["README.md", "tutorial.md", "which-fusion.md"]
+
+
+@pytest.mark.long
+def test_the_study_from_raw_bags_prints_what_its_page_says(tmp_path: Path) -> None:
+    """Each command of the page in turn; its experiment is written where it stands; `…` in a block: lines left out."""
+    for name in ("logs", "tools"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    page, printed = (ROOT / "docs/guide/study.md").read_text(encoding="utf-8"), ""
+    for kind, block in re.findall(r"```(\w+)\n(.*?)```", page, re.DOTALL):
+        if kind == "yaml":
+            (tmp_path / "study.yaml").write_text(block, encoding="utf-8")
+        elif kind == "sh":
+            for command in block.splitlines():
+                done = subprocess.run(
+                    command, shell=True, cwd=tmp_path, env=os.environ | {"PATH": path}, capture_output=True, text=True
+                )
+                assert done.returncode == 0, (command, done.stderr)
+                printed = done.stdout
+        else:
+            elided = ".*".join(re.escape(part) for part in re.split(r"^…\n", block, flags=re.MULTILINE))
+            assert re.fullmatch(elided, printed, re.DOTALL), (block, printed)
+    assert (tmp_path / "out/study/report.html").is_file()
+
+
+def test_what_is_put_into_the_bags_is_in_the_intervals_of_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    put_in = importlib.import_module("study_bags")
+    page = (ROOT / "docs/guide/study.md").read_text(encoding="utf-8")
+    blocks = "".join(re.findall(r"```text\n(.*?)```", page, re.DOTALL))
+    told = [tuple(map(float, found)) for found in re.findall(r" ([\d.-]+) s \(95 %: ([\d.-]+) … ([\d.-]+) s", blocks)]
+    assert len(told) == 3
+    for true_s, (found_s, low_s, high_s) in zip((put_in.EGO_DELAY_S, 0.0, put_in.CLOCK_AHEAD_S), told, strict=True):
+        assert low_s < true_s < high_s
+        assert low_s < found_s < high_s
+    assert f"{put_in.CLOCK_AHEAD_S:g} s ahead" in page
+    assert f"tell of {put_in.EGO_DELAY_S:g} s before" in page
+    assert f"takes {put_in.RADIO_S:g} s" in page
 
 
 def test_experiments_on_the_page_load(tmp_path: Path) -> None:

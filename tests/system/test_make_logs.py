@@ -23,6 +23,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_object_pb2 import MovingObject
+from osi3.osi_sensordata_pb2 import SensorData
 from ruamel.yaml import YAML
 from shapely import LineString, Point, Polygon, affinity
 
@@ -98,6 +99,26 @@ def test_the_committed_log_is_what_the_tool_makes(tmp_path: Path) -> None:
     tool = [sys.executable, str(ROOT / "tools" / "make_logs.py")]
     subprocess.run([*tool, "tc016d", "--out", str(tmp_path)], check=True)
     assert (tmp_path / LOG.name).read_bytes() == LOG.read_bytes(), "run python tools/make_logs.py tc016d"
+
+
+def test_two_makes_of_the_bags_give_the_same_bytes(tmp_path: Path) -> None:
+    """The stack's lists are logged after their stamps, the unit's have another clock."""
+    tool = [sys.executable, str(ROOT / "tools" / "make_logs.py"), "--bags", "--out"]
+    for name in ("first", "second"):
+        subprocess.run([*tool, str(tmp_path / name)], check=True)
+    assert sorted(path.name for path in (tmp_path / "first").iterdir()) == ["ego.mcap", "rsu.mcap"]
+    late_ns: dict[str, set[int]] = {}
+    for name in ("ego.mcap", "rsu.mcap"):
+        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
+        with (tmp_path / "first" / name).open("rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages():
+                late_ns.setdefault(channel.topic, set()).add(message.log_time - message.publish_time)
+    assert late_ns == {"ground_truth": {0}, "ego/objects": {0}, "stack/objects": {40_000_000}, "rsu/objects": {0}}
+    with (tmp_path / "first/rsu.mcap").open("rb") as stream:
+        first = SensorData.FromString(next(iter(make_reader(stream).iter_messages()))[2].data)
+    stamp_s, captured_s = (t.seconds + t.nanos * 1e-9 for t in (first.timestamp, first.last_measurement_time))
+    assert captured_s == pytest.approx(0.03 + 0.13)
+    assert stamp_s - captured_s == pytest.approx(0.09)
 
 
 def test_a_failed_make_leaves_no_file(make_logs: Any, tmp_path: Path) -> None:
