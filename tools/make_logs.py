@@ -196,7 +196,9 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(recipes())}; none: all")
     parser.add_argument("--out", type=Path, default=logs, help="folder (default: the project's logs/)")
     parser.add_argument("--long", action="store_true", help="only the long drive, city.mcap; it is not committed")
-    parser.add_argument("--bags", action="store_true", help="only the bags of docs/guide/study.md; they are not committed")
+    parser.add_argument(
+        "--bags", action="store_true", help="only the bags of docs/guide/study.md; they are not committed"
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="how long the long drive is (default: 60)")
     parser.add_argument("--objects", type=int, default=100, help="how many there are at a time (default: 100)")
     arguments = parser.parse_args()

@@ -1,4 +1,4 @@
-"""The bags of the study in docs/guide/study.md: `logs/crossing.mcap` as a vehicle and a roadside unit would have recorded it.
+"""The bags of docs/guide/study.md: `logs/crossing.mcap` as a vehicle and a roadside unit would have recorded it.
 
     python tools/make_logs.py --bags --out out/bags
 

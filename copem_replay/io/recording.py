@@ -189,7 +189,8 @@ def choose_topic(
         raise RecordingError(
             f"no list of true objects; it holds {_listed(log.channels)}; "
             + "beside a recording that has one its lists replay by `together: [THAT, THIS]`; " * units
-            + "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema (docs/guide/recordings.md)",
+            + "`read: {topic: …, objects: …, id: …}` names the fields of a list of any schema "
+            "(docs/guide/recordings.md)",
             path=log.path,
         )
     if topic is not None and topic not in topics:
