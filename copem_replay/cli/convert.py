@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from copem_replay.core.errors import InputError
-from copem_replay.core.text import printable
+from copem_replay.core.errors import InputError, printable
 
 app = typer.Typer(
     help="Convert a data set or a simulation to a recording.\n\nOf OSI truth, as MCAP.", rich_markup_mode=None

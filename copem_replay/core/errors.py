@@ -16,7 +16,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from copem_replay.core.text import printable
+
+def printable(text: str) -> str:
+    """On one line, and without what a terminal would act on: names in a recording may hold anything."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 class CopemError(Exception):

@@ -7,11 +7,6 @@ import textwrap
 from collections.abc import Iterable
 
 
-def printable(text: str) -> str:
-    """On one line, and without what a terminal would act on: names in a recording may hold anything."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-
-
 def wrapped(line: str, width: int | None) -> list[str]:
     """A line in as many as it takes to fit, broken at spaces, the further ones indented; None: as it is.
 

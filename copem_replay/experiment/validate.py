@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from copem_replay.core.errors import EgoError, RecordingError
-from copem_replay.core.text import printable, unknown
+from copem_replay.core.errors import EgoError, RecordingError, printable
+from copem_replay.core.text import unknown
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, references
 from copem_replay.experiment.drive import SettingsError, of_log, with_settings

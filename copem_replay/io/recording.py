@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.errors import EgoError, RecordingError
-from copem_replay.core.text import counted, printable
+from copem_replay.core.errors import EgoError, RecordingError, printable
+from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
 from copem_replay.io.ground_truth import assemble

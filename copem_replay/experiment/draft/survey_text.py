@@ -6,7 +6,8 @@ import shlex
 from collections.abc import Mapping
 from typing import Final
 
-from copem_replay.core.text import counted, printable
+from copem_replay.core.errors import printable
+from copem_replay.core.text import counted
 from copem_replay.experiment.draft.findings import Role, Survey, TopicFound, TruthFound, UnitFound
 from copem_replay.experiment.draft.template import read_block
 from copem_replay.io.plausibility import MAX_GAP_S

@@ -6,7 +6,7 @@ import html
 import re
 from collections.abc import Iterable, Sequence
 
-from copem_replay.core.text import printable
+from copem_replay.core.errors import printable
 
 
 class Html(str):

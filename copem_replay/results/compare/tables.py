@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from copem_replay.core.errors import OutputError
+from copem_replay.core.errors import OutputError, printable
 from copem_replay.core.files import atomic_file
-from copem_replay.core.text import printable, wrapped
+from copem_replay.core.text import wrapped
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.summary_text import as_text
 from copem_replay.results.compare.limits import ALL_ALIKE
