@@ -79,12 +79,17 @@ def resolved(experiment: Experiment) -> Experiment:
 
 
 def without_points(experiment: Experiment) -> list[str]:
-    """Sweeps of an experiment that no configuration is changed by, and what would help."""
+    """Sweeps of an experiment that no configuration is changed by, and what would help; what no sweep changes."""
     if experiment.sweep is None:
         return []
     there = {point.sweep for point in points(experiment)}
     none = [kind for kind in KINDS if getattr(experiment.sweep, kind) and kind not in there]
-    return [f"sweep of {kind}: it changes no configuration{_unstated(experiment, kind)}" for kind in none]
+    notes = [f"sweep of {kind}: it changes no configuration{_unstated(experiment, kind)}" for kind in none]
+    if experiment.outputs:
+        notes.append(
+            f"sweep: leaves {', '.join(experiment.outputs)} out, for the output of a stack is as it was recorded"
+        )
+    return notes
 
 
 def _unstated(experiment: Experiment, kind: str) -> str:

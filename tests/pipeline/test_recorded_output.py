@@ -157,6 +157,17 @@ class TestWhatAnEntryTellsOf:
 
 
 class TestMeasured:
+    def test_a_sweep_leaves_it_out_and_says_so(self, tmp_path: Path) -> None:
+        lists = [list_of(0.5, car(30))]
+        units = {"alone": {"units": ["rsu"], "latency_s": 0.1}}
+        experiment = plan(drive(tmp_path / "a.mcap", lists, lists), sweep={"latency_s": [0, 0.2]})
+        data = experiment.as_written()
+        experiment = Experiment.model_validate(data | {"configurations": data["configurations"] | units})
+        _, result = replayed(experiment)
+        assert result.sweep is not None
+        assert set(result.sweep["configuration"]) == {"alone"}
+        assert "sweep: leaves stack out, for the output of a stack is as it was recorded" in result.notes
+
     def test_as_union_of_the_same_lists(self, tmp_path: Path) -> None:
         """Late by nothing, the union of one unit hands its lists on, too: every figure and row alike."""
         lists = [list_of(t, car(30.2, existence=0.6), car(50, existence=0.7)) for t in (0.3, 0.5, 0.9)]
