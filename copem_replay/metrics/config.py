@@ -33,9 +33,9 @@ def _only(self: BaseModel, *names: str) -> None:
 class Within(Frozen):
     """Which objects matter, by the truth: in a polygon or near the ego's way at their onset, or soon on that way.
 
-    `corridor_m`: at most so far from the way of the ego's centre through the log. `conflict_s`: at any instant until
-    the end of its episode the object, keeping its velocity, would within so long be where the ego, keeping its speed,
-    will sweep its way, and the margin of `measure.conflict` around it.
+    `corridor_m`: at most so far from the way that the ego's centre takes from the onset to the end of the episode.
+    `conflict_s`: at any instant until the end of its episode the object, keeping its velocity, would within so long be
+    where the ego, keeping its speed, will sweep its way, and the margin of `measure.conflict` around it.
     """
 
     polygon_m: Polygon | None = None

@@ -1,7 +1,8 @@
 """Only what matters: of the objects that have an onset those within an area, near the ego's way, or soon on it.
 
 Decided on the truth. An area and the way: by the object's centre at the onset; a conflict: at any of its frames from
-the onset to the end of its episode.
+the onset to the end of its episode. The way is what lies ahead: what the ego has behind it at the onset no longer
+matters, nor does a way that it takes when the object is gone.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def in_words(asked: Within) -> str:
     if asked.polygon_m is not None:
         return "outside the polygon at their onset"
     if asked.corridor_m is not None:
-        return f"more than {asked.corridor_m:g} m beside the ego's way at their onset"
+        return f"more than {asked.corridor_m:g} m beside the ego's way ahead"
     return f"never within {asked.conflict_s:g} s of the ego's way"
 
 
@@ -61,18 +62,22 @@ def _at_onset(scene: Scene, truth: Tracks, found: Episodes, experiment: MetricsS
     if asked.polygon_m is not None:
         return there & in_areas(x_m, y_m, x_m, y_m, corners(asked.polygon_m), np.inf)
     assert asked.corridor_m is not None
-    beside_m = _beside(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m)
+    beside_m = _beside(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m, found)
     near: Bool = there & (beside_m <= asked.corridor_m + _TOLERANCE_M)
     return near
 
 
-def _beside(ego: EgoPath, x_m: Float, y_m: Float) -> Float:
-    """(K,) how far places are from the way of the ego's centre through the log."""
+def _beside(ego: EgoPath, x_m: Float, y_m: Float, found: Episodes) -> Float:
+    """(M,) how far places are from the way that the ego's centre takes from the onset to the end of each episode."""
     import shapely
 
-    way = ego.path[:-1, 1:3]  # the last vertex is where it would go on to
-    line = shapely.LineString(way) if len(way) > 1 else shapely.Point(way[0])
-    away_m: Float = shapely.distance(line, shapely.points(x_m, y_m))
+    ends_m = [np.interp(time_s, ego.frame_s, ego.frame_m) for time_s in (found.onset_s, found.ended_s)]
+    ways = []
+    for from_m, to_m in zip(*ends_m, strict=True):
+        first, after = np.searchsorted(ego.path[:, 0], (from_m, to_m))
+        along_m = np.concatenate([[from_m], ego.path[first:after, 0], [to_m]])
+        ways.append(np.stack([np.interp(along_m, ego.path[:, 0], ego.path[:, k]) for k in (1, 2)], axis=1))
+    away_m: Float = shapely.distance([shapely.LineString(way) for way in ways], shapely.points(x_m, y_m))
     return away_m
 
 
