@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError, InputError
 from copem_replay.core.object_list import Inputs, ObjectLists, entries_of
@@ -88,6 +89,21 @@ class TestTimes:
         ideal = figures(result, "stack:ideal")
         assert ideal[["output_latency_s", "output_delay_s", "input_age_s"]].isna().all()
         assert row(result, "stack:ideal")["detection_s"] == pytest.approx(0.3)
+
+    @pytest.mark.parametrize("lacks", ["rsu", None])
+    def test_an_input_that_a_log_lacks(self, tmp_path: Path, lacks: str | None) -> None:
+        """Of two logs alike the newest input is .35 s old; where one lacks the unit, it goes by the other alone."""
+        rsu = [list_of(t, car(30)) for t in (0.3, 0.4, 0.7001)]
+        paths = [drive(tmp_path / f"{k}.mcap", [logged(0.7, list_of(0.5, car(30)))], rsu) for k in "ab"]
+        second = {"file": str(paths[1])} | ({"units": {lacks: None}} if lacks else {})
+        (tmp_path / "e.yaml").write_text(dump(plan(paths[0], logs=[str(paths[0]), second]).as_written()))
+        result = cr.run(tmp_path / "e.yaml", jobs=1)
+        of = result.summary.set_index("configuration")
+        assert of["input_age_s"]["stack"] == pytest.approx(0.35)
+        assert of["output_latency_s"]["stack"] == pytest.approx(0.2)
+        assert of["n"].to_dict() == {"stack": 2, "stack:ideal": 1 if lacks else 2}
+        said = "configuration stack:ideal: none of its units in 1 of 2 logs (b), and left out there"
+        assert (said in result.notes) == (lacks is not None)
 
     def test_what_the_messages_say_goes_before(self, tmp_path: Path) -> None:
         """Of .3, available at .5 by its own words, whatever the log time and `delay_s`."""

@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
+import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.report import write_report
@@ -235,6 +236,24 @@ class TestWords:
         assert "[" not in lines[3]
         assert any(line.startswith("There are no intervals: there are fewer than 5 logs") for line in lines)
         assert not any("excluding 0" in line for line in lines)
+
+    def test_what_a_log_leaves_out_is_no_winner(self, tmp_path: Path) -> None:
+        """Soonest by its mean, `half` is over one of two logs: it is ranked last and compared where both are."""
+        logs = ("logs: [drive.mcap]", "logs: [drive.mcap, {file: two.mcap, units: {weak: null}}]")
+        for name in ("drive", "two"):
+            drive(tmp_path / f"{name}.mcap")
+        (tmp_path / "e.yaml").write_text(changed(logs))
+        folder = cr.run(tmp_path / "e.yaml", jobs=1).save(tmp_path / "results")
+        rows, whole = summary_rows(folder), Page(page(load_study(folder)))
+        lines = whole.lines()
+        assert int(rows["half"]["n"]) == int(rows["late"]["n"]) / 2
+        assert float(rows["half"]["ttd_rmst_s"]) < float(rows["late"]["ttd_rmst_s"])
+        assert "late has the shortest mean time" in lines[2]
+        assert lines[3].startswith("half is ranked last: some logs lack the units, and means and shares are over")
+        assert any(line.startswith("Sooner by pairs, without an interval: half (−") for line in lines)
+        assert not any(line.startswith("Later") and "half" in line for line in lines)
+        note = "configuration half: none of its units in 1 of 2 logs (two), and left out there"
+        assert any(note in line for line in whole.words.splitlines())
 
     def test_who_is_alike_is_no_winner(self, tmp_path: Path) -> None:
         text = changed(ONE, ("  hit: {units: [ego], latency_s: 1.8}", "  hit: {units: [weak]}"), *ALONE[:2], ALONE[3])

@@ -28,15 +28,25 @@ def contenders(results: Results, names: Sequence[str] | None = None) -> tuple[st
 
 
 def soonest_first(results: Results, names: Sequence[str]) -> tuple[str, ...]:
-    """By the mean time to detection; of equals the one with which more pass, then the first."""
-    rows = results.summary.set_index("configuration")
+    """By the mean time to detection; of equals the one with which more pass, then the first.
 
-    def rank(name: str) -> tuple[float, float]:
+    Last come those that a log leaves out: their means are over fewer objects.
+    """
+    rows = results.summary.set_index("configuration")
+    fewer = measured_elsewhere(results, names)
+
+    def rank(name: str) -> tuple[bool, float, float]:
         row = rows.loc[name]
         mean_s, passes = float(row[RANKED_BY]), float(row.get("pass_share", math.nan))
-        return (math.inf if math.isnan(mean_s) else mean_s, 0.0 if math.isnan(passes) else -passes)
+        return name in fewer, math.inf if math.isnan(mean_s) else mean_s, 0.0 if math.isnan(passes) else -passes
 
     return tuple(sorted(names, key=rank))
+
+
+def measured_elsewhere(results: Results, names: Sequence[str]) -> tuple[str, ...]:
+    """Of some configurations those with fewer rows than others: logs that lack their units leave them out."""
+    rows = results.summary.set_index("configuration")["n"].loc[list(names)]
+    return tuple(name for name in names if rows[name] < rows.max())
 
 
 def default_baseline(results: Results) -> str:

@@ -12,7 +12,7 @@ from copem_replay.core.text import counted
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS
 from copem_replay.report.figures.captions import per_cent, plain
-from copem_replay.report.figures.contenders import RANKED_BY
+from copem_replay.report.figures.contenders import RANKED_BY, measured_elsewhere
 from copem_replay.report.html.headers import signed_difference
 from copem_replay.report.html.markup import Html, joined, listed, tag, text
 from copem_replay.report.html.setup import some, together
@@ -55,6 +55,7 @@ def _sentences(study: Study) -> Iterator[str]:
         yield "Only the ground truth holds the measured objects: no configuration detects any of them in any run."
     else:
         yield _soonest(study)
+        yield from _elsewhere(study)
         yield from _others(study)
         yield from _against_baseline(study)
         yield from _detected(study, share)
@@ -90,6 +91,15 @@ def _soonest(study: Study) -> Html:
         to = others if undecided == rest else f"{undecided} of {others}"
         whom = f" The interval of their difference to {to} includes 0."
     return joined([_missing(study, unsure), tag("b", together(same)), f" detect {when}.{whom}"])
+
+
+def _elsewhere(study: Study) -> Iterator[str]:
+    """Configurations that some logs leave out."""
+    if fewer := measured_elsewhere(study.results, study.contenders):
+        yield (
+            f"{together(list(fewer))} {'is' if len(fewer) == 1 else 'are'} ranked last: some logs lack the units, and "
+            "means and shares are over the others alone. Differences are over what both have."
+        )
 
 
 def _missing(study: Study, unsure: pd.DataFrame) -> str:
@@ -152,8 +162,12 @@ def _others(study: Study) -> Iterator[str]:
         )
     if len(sooner):  # by pairs a mean over censored times may rank the other way round
         yield f"Sooner by pairs, though later in the table: {_each(sooner)}."
-    if len(unsure):
-        yield f"Later, without an interval: {_each(unsure)}."
+    for said, rows in (
+        ("Later", unsure[unsure["difference"] > 0]),
+        ("Sooner by pairs", unsure[unsure["difference"] < 0]),
+    ):
+        if len(rows):
+            yield f"{said}, without an interval: {_each(rows)}."
     if len(later) and len(study.contenders) > 2:
         one = len(same) == 1
         yield (
