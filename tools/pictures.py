@@ -72,7 +72,7 @@ def main() -> None:
 def _replay(folder: Path) -> None:
     """`copem-replay run logs/tc016d.yaml`, with the median run shown."""
     from copem_replay.experiment.file import load, log_paths
-    from copem_replay.experiment.schema import Show
+    from copem_replay.experiment.show_keys import Show
     from copem_replay.experiment.validate import problems, read_logs
     from copem_replay.pipeline.run import run
     from copem_replay.results.write import write_results

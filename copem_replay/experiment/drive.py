@@ -12,8 +12,7 @@ from pydantic import ValidationError
 
 from copem_replay.core.text import counted
 from copem_replay.core.yaml import Key
-from copem_replay.experiment.log_settings import LogSettings
-from copem_replay.experiment.schema import Configuration, Experiment, Unit
+from copem_replay.experiment.schema import Configuration, Experiment, LogSettings, Unit
 from copem_replay.metrics.config import Measure, Objects
 
 _INSTEAD = {"on": "at", "at": "on", "pem": "recorded", "recorded": "pem", "classes": "ids", "ids": "classes"}

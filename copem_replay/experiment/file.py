@@ -13,8 +13,7 @@ from pydantic import ValidationError
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.yaml import AliasesError, Key, NotYamlError, read
-from copem_replay.experiment.log_settings import LogSettings
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.shape_problems import by_key
 from copem_replay.io.together import Place, Together
 

@@ -15,6 +15,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    SerializerFunctionWrapHandler,
     Tag,
     field_validator,
     model_serializer,
@@ -22,10 +23,11 @@ from pydantic import (
 )
 
 from copem_replay.communication.latency import Delay
-from copem_replay.communication.link import LINKS, ConstantLink, LinkModel, UnitLinks
-from copem_replay.core.components import Count, Frozen, Id, Latency, Positive, Slot, at_key, described
+from copem_replay.communication.link import ConstantLink, LinkModel, UnitLinks
+from copem_replay.core.components import Count, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
 from copem_replay.core.tracks import TRUTH
-from copem_replay.experiment.log_settings import LogEntry
+from copem_replay.experiment.link_keys import AnyLink, IssueRate, LinkName, LinkOf
+from copem_replay.experiment.show_keys import Show
 from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
 from copem_replay.fusion.base import Fusion, Ideal
@@ -61,25 +63,6 @@ def _configuration_name(value: str) -> str:
     return value
 
 
-def _link_name(value: str) -> str:
-    if value in ("none", "default", ""):
-        raise ValueError(f"{value!r} cannot be a link's name")
-    return value
-
-
-def _what_link(value: object) -> str:
-    if isinstance(value, LinkModel) or (isinstance(value, dict) and "kind" in value):
-        return "link"
-    return "by unit" if isinstance(value, dict) else "name"
-
-
-LinkName = Annotated[Id, AfterValidator(_link_name)]
-AnyLink = Annotated[LinkModel, Slot("link", LINKS, "radio")]
-LinkOf = Annotated[
-    Annotated[AnyLink, Tag("link")] | Annotated[Id, Tag("name")] | Annotated[dict[Id, Id], Tag("by unit")],
-    Discriminator(_what_link),
-]
-"""A link: by its name, by unit with `default`, or as it is."""
 UnitName = Annotated[Id, AfterValidator(_unit_name)]
 ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
 
@@ -127,10 +110,6 @@ class Unit(Placement):
         if self.phase_s and self.rate_hz is None:
             raise ValueError("phase_s: needs rate_hz (without it there is one list per frame of the truth)")
         return self
-
-
-IssueRate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
-"""Fused lists per second."""
 
 
 class Configuration(Frozen):
@@ -182,6 +161,60 @@ class Configuration(Frozen):
         return None if link == "none" else link
 
 
+MEASURED_PER_LOG = ("objects", "onset", "distance_to", "annotated")
+"""Keys of `measure` that a log may have its own of; the others say what the tables of all logs have in common."""
+
+
+class LogSettings(Frozen):
+    """A recording, and what is otherwise for it: keys that are given replace those of the experiment, lists whole.
+
+    `file`: as a plain entry, wildcards too. `name`: what the log is called, by default as its file. Of `units` and
+    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it. `together`, in the place of
+    `file`: several recordings of one drive; `clock_offset_s`: how far the clock of one is ahead of the first one's.
+    """
+
+    file: Annotated[str, Field(min_length=1)] | None = None
+    together: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=2)] | None = None
+    clock_offset_s: dict[str, Number] = Field(default_factory=dict)
+    name: Annotated[Id, Field(min_length=1)] | None = None
+    ego: Ego | None = None
+    window_s: WindowOf | None = None
+    units: dict[Id, dict[str, Any] | None] = Field(default_factory=dict)
+    obstacles: tuple[Obstacle, ...] | None = None
+    read: HowRead | None = None
+    measure: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.file is None) == (self.together is None):
+            raise ValueError("expected one of `file: <recording>` and `together: [<recording>, <recording>]`")
+        paths = self.together or ()
+        if len(set(paths)) < len(paths):
+            raise ValueError(f"together: expected each recording once, found {max(paths, key=paths.count)!r} twice")
+        for name, offset_s in self.clock_offset_s.items():
+            if name not in paths:
+                expected = ", ".join(paths[1:]) or "none without `together`"
+                raise ValueError(f"clock_offset_s: expected a recording of `together` ({expected}), found {name!r}")
+            if name == paths[0] and offset_s:
+                raise ValueError(f"clock_offset_s: {name!r} is the first, by whose clock the others are ahead")
+        return self
+
+    @field_validator("measure")
+    @classmethod
+    def _of_a_log(cls, measure: dict[str, Any]) -> dict[str, Any]:
+        for key in measure:
+            if key not in MEASURED_PER_LOG:
+                names = ", ".join(MEASURED_PER_LOG)
+                raise ValueError(f"{key}: goes for all logs alike; a log has its own {names}")
+        return measure
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Only keys that are given: a `null` would be one, too."""
+        written: dict[str, Any] = write(self)
+        return {key: value for key, value in written.items() if key in self.model_fields_set}
+
+
 def output_unit(configuration: str) -> str:
     """What the unit is called that stands for the recorded output of a configuration."""
     return f"{configuration} (recorded)"
@@ -208,31 +241,12 @@ def _with_ideals(configurations: dict[str, Configuration]) -> dict[str, Configur
     return result
 
 
-WhichRun = Annotated[int, Field(strict=True, ge=0)] | Literal["median", "worst", "best"]
+def _what_log(value: object) -> str:
+    return "settings" if isinstance(value, dict | LogSettings) else "path"
 
 
-def _each_once(runs: tuple[WhichRun, ...]) -> tuple[WhichRun, ...]:
-    twice = [run for k, run in enumerate(runs) if run in runs[:k]]
-    if twice:
-        raise ValueError(f"expected each run once, found {twice[0]} twice")
-    return runs
-
-
-class Show(Frozen):
-    """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
-
-    `run: null` writes none; `pipeline/selected_runs.py` says which run is `median`, `worst` or `best`.
-    """
-
-    logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
-    run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_each_once)] | None = 0
-    configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
-
-    def asked(self) -> tuple[WhichRun, ...]:
-        """The runs, one or several or none, in their order."""
-        if isinstance(self.run, tuple):
-            return self.run
-        return () if self.run is None else (self.run,)
+LogEntry = Annotated[Annotated[str, Tag("path")] | Annotated[LogSettings, Tag("settings")], Discriminator(_what_log)]
+"""A path, with wildcards or not, or a mapping with settings."""
 
 
 def _as_file(schema: dict[str, Any]) -> None:

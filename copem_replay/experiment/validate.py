@@ -25,8 +25,7 @@ from copem_replay.experiment.file import (
     parse,
     places_of,
 )
-from copem_replay.experiment.log_settings import LogSettings
-from copem_replay.experiment.schema import Experiment, output_unit
+from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.experiment.shape_problems import by_key
 from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of

@@ -21,8 +21,7 @@ from copem_replay.core.errors import OutputError
 from copem_replay.core.yaml import dump
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.file import at_place
-from copem_replay.experiment.log_settings import LogSettings
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import place_of
 from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
