@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 import bench_fusion
+import bench_links
 import bench_long
 import bench_memory
 import bench_read
@@ -228,6 +229,13 @@ def crowd() -> Iterator[dict[str, object]]:
         yield bench_long.crowd(folder, frames, count)
 
 
+def links() -> Iterator[dict[str, object]]:
+    """A minute of 20 objects, five of which send what they see by radio: what it costs that arrivals are drawn."""
+    with _scratch() as folder:
+        _write_truth(folder / "minute.mcap", boxes(600, 20))
+        yield from bench_links.links(read(folder / "minute.mcap", name="minute", ego="0"))
+
+
 @contextmanager
 def _scratch() -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
@@ -284,7 +292,7 @@ def memory() -> Iterator[dict[str, object]]:
     yield from bench_memory.memory(*_loaded(ROOT / "logs/crossing.yaml"))
 
 
-BENCHES = (visibility, memory, paper, reading, writing, commands, reports, fusion, peers, crowd, long)
+BENCHES = (visibility, memory, paper, reading, writing, commands, reports, fusion, peers, links, crowd, long)
 
 if __name__ == "__main__":
     main(sys.argv[1:])

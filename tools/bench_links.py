@@ -1,0 +1,53 @@
+"""What drawn arrivals cost: a minute of 20 objects and five units at 10 Hz, by a link that is sure and by one that is not.
+
+Medians of nine runs of all, in turn, in seconds of the processor, of which the constant latency's are taken away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from bench_memory import interleaved
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.run import run
+
+RUNS = 20
+LINKS: dict[str, dict[str, Any]] = {
+    "constant": {"latency": 0.06},
+    "drawn": {
+        "latency": {"kind": "gamma", "min_s": 0.02, "mean_s": 0.06, "shape": 2},
+        "reception": {"kind": "shadowing", "half_at_m": 150, "exponent": 2.27, "sigma_db": 3, "blocked_db": 9},
+        "memory": {"reception": [{"share": 1.0, "correlation_s": 0.5}]},
+        "order": "kept",
+    },
+}
+
+
+def links(recording: Recording) -> Iterator[dict[str, object]]:
+    for what, fusion, accuracy in (("ideal", "ideal", False), ("gnn", "gnn", True)):
+        plans = [plan(link, fusion, accuracy) for link in LINKS.values()]
+        ready = [[prepare(recording, one)] for one in plans]
+        constant_s, drawn_s = interleaved(
+            [lambda one=one, its=its: run(one, [recording], ready=its) for one, its in zip(plans, ready, strict=True)]
+        )
+        yield {
+            f"links_{what}_constant_ms_a_run": round(constant_s / RUNS * 1e3, 2),
+            f"links_{what}_drawn_ms_a_run": round(drawn_s / RUNS * 1e3, 2),
+            f"links_{what}_more_ms_a_run": round((drawn_s - constant_s) / RUNS * 1e3, 2),
+        }
+
+
+def plan(link: dict[str, Any], fusion: str, accuracy: bool) -> Experiment:
+    """Five units carried by the first objects, all 20 objects seen all around."""
+    return Experiment.model_validate({
+        "version": 1, "logs": ["minute.mcap"], "ego": 0, "runs": RUNS, "seed": 1, "show": None,
+        "pems": {"around": [{"detection": {"kind": "visible_share"},
+                             "error": {"kind": "gaussian", "covariance_m2": [[0.25, 0.0], [0.0, 0.25]]}}]},
+        "units": {f"u{k}": {"on": k, "height_m": 1.8, "pem": "around", "rate_hz": 10} for k in range(5)},
+        "links": {"v2x": link},
+        "configurations": {"coop": {"units": "all", "link": "v2x", "fusion": {"kind": fusion}}},
+        "measure": {"accuracy": accuracy},
+    })  # fmt: skip
