@@ -48,6 +48,6 @@ def plan(link: dict[str, Any], fusion: str, accuracy: bool) -> Experiment:
                              "error": {"kind": "gaussian", "covariance_m2": [[0.25, 0.0], [0.0, 0.25]]}}]},
         "units": {f"u{k}": {"on": k, "height_m": 1.8, "pem": "around", "rate_hz": 10} for k in range(5)},
         "links": {"v2x": link},
-        "configurations": {"coop": {"units": "all", "link": "v2x", "fusion": {"kind": fusion}}},
+        "configurations": {"coop": {"units": "all", "link": "v2x", "issue_hz": 10, "fusion": {"kind": fusion}}},
         "measure": {"accuracy": accuracy},
     })  # fmt: skip

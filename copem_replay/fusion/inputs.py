@@ -6,6 +6,7 @@ is left out, since it knows where it is.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numba as nb
@@ -38,15 +39,15 @@ def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[
     start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
     picked = np.empty(int(valid.sum()), dtype=np.int64)
     _pick(valid, drawn, order, bounds, start, picked)
-    template = _template(heard, claims)
+    covariances = dict(zip(COVARIANCES, floored(heard), strict=True))
+    template = _template(heard, claims, covariances)
     entries = taken(template, picked)
     run = np.repeat(np.arange(len(valid)), valid.sum(axis=1))
     for name in VALUES:
         values = getattr(heard, name)
         if len(values) > 1:
             entries[name] = values[run, picked]
-    ee, en, nn = floored(heard)
-    for name, values in zip(COVARIANCES, (ee, en, nn), strict=True):
+    for name, values in covariances.items():
         if len(values) > 1:
             entries[name] = values[run, picked]
     return ObjectLists(start, entries), run, picked
@@ -72,13 +73,13 @@ def inputs(
     )  # fmt: skip
 
 
-def _template(heard: Tracks, claims: Claims) -> Entries:
+def _template(heard: Tracks, claims: Claims, covariances: Mapping[str, Float]) -> Entries:
     """(P,) all that is the same in all runs."""
     entries = np.zeros(len(heard.frame_ix), dtype=ENTRY)
     for name in VALUES:
         if len(values := getattr(heard, name)) == 1:
             entries[name] = values[0]
-    for name, values in zip(COVARIANCES, floored(heard), strict=True):
+    for name, values in covariances.items():
         if len(values) == 1:
             entries[name] = values[0]
     entries["existence"], entries["class_probability"] = claims.existence, claims.class_probability

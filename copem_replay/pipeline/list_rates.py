@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from copem_replay.communication.arrivals import fusion_schedule
@@ -19,8 +21,11 @@ def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, f
 
     Units that only some runs have are taken to be there. Where arrivals differ it is all runs together.
     """
-    runs = experiment.runs if replay.expanded.with_(experiment).arrivals_differ else 1
-    of_run = [_rates(replay.lists_only(experiment, np.array([run])), np.array([run])) for run in range(runs)]
+    world = replay.lists_only(experiment)
+    of_run = []
+    for run in range(experiment.runs if world.experiment.arrivals_differ else 1):
+        alone = np.array([run])
+        of_run.append(_rates(replace(world, on_air=replay.on_air(experiment, alone)), alone))
     return {name: (sum(r[name][0] for r in of_run), sum(r[name][1] for r in of_run)) for name in of_run[0]}
 
 

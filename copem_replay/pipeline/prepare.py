@@ -172,8 +172,8 @@ class Replay:
         on_air = None if runs is None else self.on_air(experiment, runs, equipped)
         return WorldChunk(self.scene, self.truth.take_rows(none), found, recorded, units, on_air=on_air)
 
-    def on_air(self, experiment: Experiment, runs: Int, equipped: Bool | None) -> OnAir | None:
-        """What drawn links go by in one run (1,); None: no link is drawn. `equipped (1, U)`: which units list."""
+    def on_air(self, experiment: Experiment, runs: Int, equipped: Bool | None = None) -> OnAir | None:
+        """What drawn links go by in one run (1,); None: none is drawn. `equipped (1, U)`: which units list."""
         units = self.expanded.with_(experiment)
         if not units.arrivals_differ:
             return None
