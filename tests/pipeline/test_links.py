@@ -1,0 +1,228 @@
+"""Links in a replay: what arrives when in each run, and what comes of it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from copem_replay.core.errors import ExperimentError
+from copem_replay.core.tracks import Tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recording import Recording
+from copem_replay.pipeline import chunking
+from copem_replay.pipeline.blocks import outcomes
+from copem_replay.pipeline.prepare import prepare
+from copem_replay.pipeline.receiver import listen, seen_by_all
+from copem_replay.pipeline.run import Result, run
+from tests.helpers import scenes
+from tests.helpers.scenes import Thing, driving, experiment, standing
+
+GAMMA = {"kind": "gamma", "min_s": 0.02, "mean_s": 0.06, "shape": 2}
+RADIO: dict[str, Any] = {
+    "latency": GAMMA,
+    "reception": {"kind": "shadowing", "half_at_m": 40, "exponent": 2.27, "sigma_db": 3, "blocked_db": 9},
+    "memory": {"reception": [{"share": 0.8, "correlation_s": 0.5}]},
+    "order": "kept",
+    "channel": {"kbps": 100},
+}
+BURSTS: dict[str, Any] = {"reception": {"kind": "gilbert_elliott", "bad_share": 0.4, "bad_lasts_s": 0.5}}
+ERROR = {"kind": "gaussian", "covariance_m2": [[0.3, 0.0], [0.0, 0.3]]}
+HALF = [{"detection": {"kind": "constant", "probability": 0.5}, "error": ERROR}]
+
+
+def traffic() -> Recording:
+    """The ego stands between two masts, 30 m away each; four cars drive by, one after the other."""
+    cars = [Thing(f"c{k}", "car", driving(60 + 15 * k, 3 + k, -10), yaw_rad=np.pi) for k in range(4)]
+    return scenes.recording([Thing("ego", "car", standing(0, 0)), *cars], until_s=8.0)
+
+
+def plan(link: object, **changes: Any) -> Experiment:
+    """Two masts and the ego, each of which lists half of what there is, by ideal fusion and by nearest neighbours."""
+    masts = {name: {"at": [x, 8], "height_m": 5, "pem": "half"} for name, x in (("east", 30.0), ("west", -30.0))}
+    units = {"ego": {"on": "ego", "height_m": 1.8, "pem": "half"}, **masts}
+    heard = {"units": "all", "link": link} if link is not None else {"units": "all"}
+    data: dict[str, Any] = {
+        "pems": {"half": HALF}, "units": units, "runs": 4, "links": {"v2x": RADIO, "bursts": BURSTS},
+        "configurations": {"coop": heard, "gnn": {**heard, "fusion": {"kind": "gnn"}}},
+    }  # fmt: skip
+    return experiment(**(data | changes))
+
+
+def heard_by(experiment: Experiment, name: str = "coop", one: int = 0, recording: Recording | None = None) -> Tracks:
+    """What reaches a receiver in one run."""
+    replay, runs = prepare(recording or traffic(), experiment), np.array([one])
+    world = replay.lists_only(experiment, runs)
+    return listen(seen_by_all(world, runs, states="true"), world, name)
+
+
+def assert_same(one: Result, other: Result) -> None:
+    assert one.table.equals(other.table)
+    assert one.summary.equals(other.summary)
+    assert one.accuracy is not None
+    assert other.accuracy is not None
+    assert one.accuracy.instants.equals(other.accuracy.instants)
+    assert one.accuracy.lists.equals(other.accuracy.lists)
+
+
+def test_a_link_that_is_sure_is_a_latency_to_the_last_bit() -> None:
+    configurations = {
+        name: {"units": "all", "fusion": {"kind": kind}} for name, kind in (("coop", "ideal"), ("gnn", "tracker"))
+    }
+    late = {"east": 0.07, "default": 0.31}
+    linked: dict[str, dict[str, Any]] = {
+        n: c | {"link": {"east": "near", "default": "far"}} for n, c in configurations.items()
+    }
+    sure = {"near": {"latency": 0.07}, "far": {"latency": 0.31, "reception": {"kind": "constant", "probability": 1}}}
+    one = run(plan(None, configurations=linked, links=sure), [traffic()])
+    other = run(plan(None, configurations={n: c | {"latency_s": late} for n, c in configurations.items()}), [traffic()])
+    assert_same(one, other)
+
+
+def test_the_ego_has_its_own_lists_at_once_and_latency_comes_on_top() -> None:
+    """No other unit's list is before its capture, nor a moment as any other's."""
+    wired = {"coop": {"units": "all", "link": {"default": "v2x", "ego": "none"}, "latency_s": {"ego": 0.25}}}
+    heard = heard_by(plan(None, configurations=wired))
+    delay_s = heard.common_arrives_s - heard.captured_s
+    of_ego = heard.frame_unit_ix == 0
+    np.testing.assert_allclose(delay_s[of_ego], 0.25, atol=1e-12)
+    others = delay_s[~of_ego]
+    assert others[np.isfinite(others)].min() > 0.02
+    assert 0.1 < np.isinf(others).mean() < 0.9
+
+
+def test_configurations_have_the_same_numbers() -> None:
+    """What a unit sends by one link is late alike in all, whatever else the experiment has; `ready` is in all."""
+    ready = {"east": {"at": [30.0, 8], "height_m": 5, "pem": "half", "ready": GAMMA}}
+    units = plan(None).as_written()["units"] | ready
+    configurations = {
+        "coop": {"units": "all", "link": "v2x"}, "one": {"units": ["east"], "link": "v2x"}, "none": {"units": "all"},
+    }  # fmt: skip
+    links = {"v2x": {"latency": 0.1, "reception": RADIO["reception"]}}
+    some = plan(None, units=units, configurations=configurations, links=links)
+    coop, one, none = (heard_by(some, name) for name in configurations)
+    east = coop.frame_unit_ix == 1
+    np.testing.assert_array_equal(coop.common_arrives_s[east], one.common_arrives_s[east])
+    came = east & np.isfinite(coop.common_arrives_s)
+    np.testing.assert_allclose((coop.common_arrives_s - none.common_arrives_s)[came], 0.1, atol=1e-12)
+    ready_s = (none.common_arrives_s - none.captured_s)[east]
+    assert (ready_s.min() > 0.02) and len(np.unique(ready_s)) == len(ready_s)
+    np.testing.assert_array_equal(heard_by(some, "one", 1).captured_s, one.captured_s)
+    assert (heard_by(some, "none", 1).common_arrives_s[east] != none.common_arrives_s[east]).all()
+
+
+@pytest.mark.parametrize("link", ["v2x", "bursts"])
+def test_a_run_alone_is_the_same_run(link: str) -> None:
+    some = plan(link)
+    replay = prepare(traffic(), some)
+    together = outcomes(replay, some, np.arange(4))
+    [alone] = outcomes(replay, some, np.array([2]))
+    [same] = [part for part in together if part.runs.tolist() == [2]]
+    assert alone.table.equals(same.table)
+    for name in alone.all_scores:
+        assert (alone.all_scores[name].issue_s == same.all_scores[name].issue_s).all()
+    assert_same(run(some, [traffic()]), run(some, [traffic()], jobs=2))
+
+
+@pytest.mark.parametrize("fleet", [False, True])
+def test_a_log_in_time_chunks_gives_the_same(monkeypatch: pytest.MonkeyPatch, fleet: bool) -> None:
+    """Queue, order and bursts go on over the cuts; units that only some runs have, too."""
+    some = plan({"default": "v2x", "ego": "bursts"})
+    if fleet:
+        cars = {"on": {"classes": ["car"], "penetration_rate": 0.5}, "height_m": 1.6, "pem": "half", "ready": GAMMA}
+        some = plan({"cars": "v2x"}, units={"ego": {"on": "ego", "height_m": 1.8, "pem": "half"}, "cars": cars})
+    whole = run(some, [traffic()])
+    monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
+    cut = run(some, [traffic()])
+    assert len(cut.replays[0].chunks) > 2
+    assert_same(whole, cut)
+
+
+def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
+    """At 100 kbit/s a list of n objects takes 8 (121 + 35 n) / 100 000 s, and its unit sends ten a second."""
+    slow = plan("slow", links={"slow": {"channel": {"kbps": 100}}})
+    replay, runs = prepare(traffic(), slow), np.array([3])
+    seen = seen_by_all(replay.world(slow), runs, states="true")
+    objects = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
+    assert len(np.unique(objects)) > 2
+    heard = heard_by(slow, one=3)
+    expected = 8 * (121 + 35 * objects) / 100_000  # less than a tenth of a second: none waits
+    np.testing.assert_allclose(heard.common_arrives_s - heard.captured_s, expected, atol=1e-9)
+
+
+def test_nothing_is_known_sooner_than_without_the_link() -> None:
+    configurations = {"plain": {"units": "all"}, "coop": {"units": "all", "link": "v2x"}}
+    table = run(plan(None, configurations=configurations, runs=20), [traffic()]).table
+    plain, coop = (table[table["configuration"] == name]["detection_s"].to_numpy() for name in configurations)
+    assert (np.nan_to_num(coop, nan=np.inf) >= np.nan_to_num(plain, nan=np.inf)).all()
+    assert (coop > plain).any()
+
+
+def one_car(loss: float, **configuration: Any) -> Experiment:
+    """The oncoming car is within 60 m from the list of 4 s on, and surely in it; lists come ten a second."""
+    return experiment(
+        links={"v2x": {"reception": {"kind": "constant", "probability": 1 - loss}}}, runs=3000,
+        configurations={"PEM": {"units": ["ego"], "link": "v2x", **configuration}}, show=None,
+        measure={"onset": {"kind": "in_range", "range_m": 80}, "exact": True, "accuracy": False},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.5])
+def test_mean_delay_by_loss_and_its_closed_form(loss: float) -> None:
+    """T p / (1 − p), and exact: each list is the first that arrives with (1 − p) p^k."""
+    result = run(one_car(loss), [scenes.oncoming_car()])
+    late_s = result.table["detection_s"] - 4.0
+    expected_s = 0.1 * loss / (1 - loss)
+    assert late_s.mean() == pytest.approx(expected_s, abs=4 * late_s.std() / math.sqrt(3000))
+    assert result.exact is not None
+    exact = result.exact[result.exact["probability"] > 0]
+    k = np.rint((exact["detection_s"].to_numpy()[:-1] - 4.0) / 0.1)
+    np.testing.assert_allclose(exact["probability"].to_numpy()[:-1], (1 - loss) * loss**k, rtol=1e-9)
+    counted = np.bincount(np.rint(late_s / 0.1).astype(int), minlength=3)[:3] / 3000
+    np.testing.assert_allclose(counted, (1 - loss) * loss ** np.arange(3), atol=4 * math.sqrt(0.25 / 3000))
+
+
+def test_fused_lists_are_issued_at_ticks() -> None:
+    """At 4 Hz the list of 4.0 s, which arrives at 4.03 s, is in the fused list of 4.25 s, and exact times say so."""
+    result = run(one_car(0.0, issue_hz=4, latency_s=0.03), [scenes.oncoming_car()])
+    assert set(result.table["detection_s"]) == {4.25}
+    assert result.exact is not None
+    assert result.exact[result.exact["probability"] > 0]["detection_s"].tolist() == [4.25]
+    assert result.summary["list_rate_hz"].tolist() == pytest.approx([4.0])
+
+
+@pytest.mark.parametrize(
+    ("link", "unit", "said"),
+    [
+        ({"latency": GAMMA}, {}, "link v2x: latency is drawn, and then lists have no common instants; use a constant one"),
+        ({"channel": {"kbps": 100}}, {}, "link v2x: lists queue, each as long as the lists before it are; use no `channel`"),
+        (BURSTS, {}, "link v2x: losses come in bursts, and lists are then lost together; use a constant reception"),
+        ({"reception": {"kind": "constant", "probability": 0.5},
+          "memory": {"reception": [{"share": 1, "correlation_s": 1}]}}, {},
+         "link v2x: losses last, and lists are then lost together; use no `memory`"),
+        ({"latency": 0.1}, {"ready": GAMMA},
+         "unit ego: `ready` is drawn, and then lists have no common instants; make it constant"),
+    ],
+)  # fmt: skip
+def test_exact_is_refused_with_the_reason(link: dict[str, Any], unit: dict[str, Any], said: str) -> None:
+    some = one_car(0.0)
+    units = {"ego": scenes.EGO_UNIT | unit}
+    refused = Experiment.model_validate(some.as_written() | {"links": {"v2x": link}, "units": units})
+    with pytest.raises(ExperimentError) as caught:
+        run(refused, [scenes.oncoming_car()])
+    assert str(caught.value) == f"exact: configuration PEM: {said}, or leave exact out"
+
+
+def test_without_a_receiver_there_is_no_distance() -> None:
+    alone = scenes.recording([Thing("c", "car", driving(60, 3, -10))], until_s=2.0, ego=None)
+    some = plan("v2x", units={"east": {"at": [30.0, 8], "height_m": 5, "pem": "half"}}, ego="none",
+                measure={"onset": {"kind": "appears"}, "distance_to": "east"})  # fmt: skip
+    with pytest.raises(ExperimentError) as caught:
+        run(some, [alone])
+    expected = (
+        "links.v2x.reception: shadowing: nobody knows the distance to a receiver, the log has no ego; use constant"
+    )
+    assert str(caught.value) == f"scene: {expected}"
