@@ -147,21 +147,35 @@ class FusedTracks:
 
 
 @nb.njit(cache=True, nogil=True)
+def newest_of(valid: Bool, captured_s: Float, entries: Int) -> float:
+    """The newest capture among the valid ones of some entries, −inf: none; `valid`, `captured_s` (P,)."""
+    newest_s = -np.inf
+    for entry in entries:
+        if valid[entry]:
+            newest_s = max(newest_s, captured_s[entry])
+    return newest_s
+
+
+@nb.njit(cache=True, nogil=True)
+def first_unit_of(valid: Bool, arrives_s: Float, unit_ix: Int, entries: Int) -> int:
+    """The unit whose list arrived first of these, −1: none; `arrives_s`, `unit_ix` (P,)."""
+    first, best_s = -1, np.inf
+    for entry in entries:
+        # Entries are in the order of units: of those that arrive together (within 1 µs) the first stays.
+        if valid[entry] and arrives_s[entry] < best_s - 1e-6:
+            best_s, first = arrives_s[entry], unit_ix[entry]
+    return first
+
+
+@nb.njit(cache=True, nogil=True)
 def _newest(valid: Bool, captured_s: Float, entries: Int, start: Int, out: Float) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
-            for c in range(start[p], start[p + 1]):
-                if valid[s, entries[c]]:
-                    out[s, p] = max(out[s, p], captured_s[entries[c]])
+            out[s, p] = newest_of(valid[s], captured_s, entries[start[p] : start[p + 1]])
 
 
 @nb.njit(cache=True, nogil=True)
 def _first_unit(valid: Bool, arrives_s: Float, unit_ix: Int, entries: Int, start: Int, out: Int) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
-            best = np.inf
-            for c in range(start[p], start[p + 1]):
-                r = entries[c]
-                # Entries are in the order of units: of those that arrive together (within 1 µs) the first stays.
-                if valid[s, r] and arrives_s[r] < best - 1e-6:
-                    best, out[s, p] = arrives_s[r], unit_ix[r]
+            out[s, p] = first_unit_of(valid[s], arrives_s, unit_ix, entries[start[p] : start[p + 1]])

@@ -38,15 +38,7 @@ def fuse(
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     given = Positions(heard.x_m, heard.y_m, *floored(heard))
     _combine_position(heard.valid, given, Information(*_information(heard)), rows, start, Positions(*out.values()))
-    spread = {}
-    for name, variance in (
-        ("z_m", None), ("length_m", "size_var_m2"), ("width_m", "size_var_m2"), ("height_m", "size_var_m2"),
-        ("vx_mps", "speed_var_m2ps2"), ("vy_mps", "speed_var_m2ps2"),
-    ):  # fmt: skip
-        out[name], spread[variance] = _combine(heard, getattr(heard, name), variance, rows, start)
-    yaw = np.asarray(heard.yaw_rad)
-    sin, yaw_variance = _combine(heard, np.sin(yaw), "yaw_var_rad2", rows, start)
-    out["yaw_rad"] = np.arctan2(sin, _combine(heard, np.cos(yaw), "yaw_var_rad2", rows, start)[0])
+    spread = _combine_scalars(heard, rows, start, out)
     captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
     stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], NO_CAPTURE_NS).max(axis=1)
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
@@ -61,9 +53,7 @@ def fuse(
         frame_unit_ix=np.zeros(len(at.issue_s), dtype=np.int64),
         arrives_s=at.issue_s[None],
         valid=valid,
-        yaw_var_rad2=yaw_variance,
-        size_var_m2=spread["size_var_m2"],
-        speed_var_m2ps2=spread["speed_var_m2ps2"],
+        **spread,
         **out,
     )
     return FusedTracks(fused, heard, rows, start)
@@ -143,23 +133,39 @@ def _axes(a: Float, b: Float, d: Float) -> tuple[Float, Float, Float, Float]:
     return high, low, c2, s2
 
 
-def _combine(heard: Tracks, values: Float, variance: str | None, rows: Int, start: Int) -> tuple[Float, Float]:
-    """Inverse-variance mean (S, P) of one scalar over the contributions, and its variance."""
-    given = getattr(heard, variance) if variance else None
-    shape = (1, len(heard.frame_ix))
-    weight = (
-        np.ones(shape)
-        if variance is None
-        else 1 / np.maximum(np.zeros(shape) if given is None else given, SMALLEST_VARIANCE)
-    )
-    mean = np.full((len(heard.valid), len(start) - 1), np.nan)
-    spread = np.full_like(mean, np.nan)
-    _combine_scalar(
-        heard.valid, values, weight, rows, start, mean, spread,
+_VARIANCES = ("yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
+_ALIKE = len(_VARIANCES)
+_WEIGHED_BY = {
+    "sin": 0, "cos": 0, "length_m": 1, "width_m": 1, "height_m": 1, "vx_mps": 2, "vy_mps": 2, "z_m": _ALIKE,
+}  # fmt: skip
+"""The scalars that are combined, and by which variance."""
+
+
+def _combine_scalars(heard: Tracks, rows: Int, start: Int, out: dict[str, Float]) -> dict[str, Float]:
+    """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances."""
+    none = np.zeros((1, len(heard.frame_ix)))
+    stated = [getattr(heard, name) for name in _VARIANCES]
+    weights = [1 / np.maximum(none if variance is None else variance, SMALLEST_VARIANCE) for variance in stated]
+    given = {"sin": np.sin(heard.yaw_rad), "cos": np.cos(heard.yaw_rad)}
+    values = [given[name] if name in given else getattr(heard, name) for name in _WEIGHED_BY]
+    shape = len(heard.valid), len(start) - 1
+    means, spreads = np.full((len(values), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
+    _scalars(
+        heard.valid, _side_by_side(values), _side_by_side([*weights, none + 1]), np.array([*_WEIGHED_BY.values()]),
+        rows, start, means, spreads,
     )  # fmt: skip
-    if given is None:
-        spread = np.where(np.isnan(spread), np.nan, 0.0)
-    return mean, spread
+    found = dict(zip(_WEIGHED_BY, means, strict=True))
+    out["yaw_rad"] = np.arctan2(found.pop("sin"), found.pop("cos"))
+    out.update(found)
+    return {
+        name: np.where(np.isnan(spread), np.nan, 0.0) if variance is None else spread
+        for name, variance, spread in zip(_VARIANCES, stated, spreads, strict=False)
+    }
+
+
+def _side_by_side(columns: list[Float]) -> Float:
+    """(S | 1, P, V) from V columns (S | 1, P)."""
+    return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
 
 def _any(valid: Bool, rows: Int, start: Int) -> Bool:
@@ -229,23 +235,35 @@ def _combine_position(
 
 
 @nb.njit(cache=True, nogil=True)
-def _combine_scalar(
-    valid: Bool, values: Float, weight: Float, rows: Int, start: Int, mean: Float, spread: Float
+def _scalars(
+    valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float
 ) -> None:
-    for s in range(mean.shape[0]):
-        i = s if values.shape[0] > 1 else 0  # one row where all runs agree
-        j = s if weight.shape[0] > 1 else 0
-        for p in range(mean.shape[1]):
-            total = first = moment = 0.0
+    # Values (S | 1, P, V) and weights (S | 1, P, W), one row where all runs agree; out: what anything contributes to.
+    there = np.empty(len(rows), np.int64)
+    for s in range(valid.shape[0]):
+        value = values[s if values.shape[0] > 1 else 0]
+        weight = weights[s if weights.shape[0] > 1 else 0]
+        for p in range(len(start) - 1):
             n = 0
             for c in range(start[p], start[p + 1]):
-                r = rows[c]
-                if not valid[s, r]:
-                    continue
-                if n == 0:
-                    first = values[i, r]
-                n += 1
-                total += weight[j, r]
-                moment += weight[j, r] * (values[i, r] - first)
-            if n:
-                mean[s, p], spread[s, p] = first + moment / total, 1 / total
+                if valid[s, rows[c]]:
+                    there[n] = rows[c]
+                    n += 1
+            if n == 0:
+                continue
+            for w in range(spreads.shape[0]):
+                total = 0.0
+                for c in range(n):
+                    total += weight[there[c], w]
+                spreads[w, s, p] = 1 / total
+            for v in range(means.shape[0]):
+                w, first = weighed_by[v], value[there[0], v]
+                moment = 0.0
+                for c in range(1, n):
+                    moment += weight[there[c], w] * (value[there[c], v] - first)
+                if moment != 0.0:
+                    total = 0.0
+                    for c in range(n):
+                        total += weight[there[c], w]
+                    moment /= total
+                means[v, s, p] = first + moment

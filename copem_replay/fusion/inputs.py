@@ -30,11 +30,11 @@ class Claims:
 def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
     """The lists of all units in all runs, F in each of S. `drawn (S, P)`: by what entries of a list are ordered."""
     kept = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
-    return gathered(heard, claims, drawn, kept)[0]
+    return _gathered(heard, claims, drawn, kept)
 
 
-def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[ObjectLists, Int, Int]:
-    """Rows of `valid (S, P)` as lists, ordered by `drawn (S, P)`; and of which run and row each entry is, (N,) each."""
+def _gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> ObjectLists:
+    """Rows of `valid (S, P)` as lists, ordered by `drawn (S, P)`."""
     order, bounds = heard.by_frame
     start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
     picked = np.empty(int(valid.sum()), dtype=np.int64)
@@ -50,7 +50,7 @@ def gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> tuple[
     for name, values in covariances.items():
         if len(values) > 1:
             entries[name] = values[run, picked]
-    return ObjectLists(start, entries), run, picked
+    return ObjectLists(start, entries)
 
 
 def inputs(

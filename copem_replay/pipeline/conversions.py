@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.object_list import COVARIANCES, ObjectLists
-from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, VALUES, Float, Int, Scene, Tracks
-from copem_replay.fusion.inputs import Claims, gathered
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from copem_replay.core.fused_tracks import FusedTracks, first_unit_of, newest_of
+from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists
+from copem_replay.core.tracks import NO_CAPTURE_NS, VALUES, Bool, Float, Int, Scene, Tracks
+from copem_replay.fusion.ideal import floored
 from copem_replay.metrics.matching import MATCH, Matches
 
 
@@ -16,14 +20,61 @@ def as_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
 
     Its truth ids are no tracks: it is not it that would confuse two objects.
     """
-    fused = fused_tracks.fused
-    object_ix = fused.row_object_ix
-    likely = np.eye(len(CLASSES))[scene.object_class[object_ix]]
-    claims = Claims(np.ones(len(object_ix)), likely, np.full(len(object_ix), -1))
-    lists, run, row = gathered(fused, claims, np.zeros(fused.valid.shape), fused.valid)
-    lists.entries["captured_s"] = fused_tracks.captured_s[run, row]
-    lists.entries["unit_ix"] = fused_tracks.first_unit_ix[run, row]
-    return lists
+    fused, heard = fused_tracks.fused, fused_tracks.heard
+    order, bounds = fused.by_frame
+    start = np.zeros((len(fused.valid), len(bounds)), dtype=np.int64)
+    entries = np.empty(int(fused.valid.sum()), dtype=ENTRY)
+    states = np.stack(np.broadcast_arrays(*(getattr(fused, name) for name in VALUES), *floored(fused)))
+    source = _Contributions(
+        heard.valid, heard.row_captured_s, heard.row_unit_ix, heard.arrives_s[0, heard.frame_ix],
+        fused_tracks.entries, fused_tracks.start,
+    )  # fmt: skip
+    words = entries.view(np.float64).reshape(len(entries), -1)
+    whose = entries.view(np.int64).reshape(words.shape)
+    _fill(fused.valid, order, bounds, states, scene.object_class[fused.row_object_ix], source, start, words, whose)
+    return ObjectLists(start, entries)
+
+
+class _Contributions(NamedTuple):
+    # What fused rows are made of, as `FusedTracks` has it.
+    valid: Bool
+    captured_s: Float
+    unit_ix: Int
+    arrives_s: Float
+    rows: Int
+    start: Int
+
+
+_CAPTURED = ENTRY.itemsize // 8 - 3
+_UNIT, _TRACK = _CAPTURED + 1, _CAPTURED + 2
+_EXISTENCE = len(VALUES) + len(COVARIANCES)
+_CLASS = _EXISTENCE + 1
+"""Places in an entry, in words of eight bytes; the states are at its beginning."""
+
+
+@nb.njit(cache=True, nogil=True)
+def _fill(
+    valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: _Contributions,
+    start: Int, words: Float, whose: Int,
+) -> None:  # fmt: skip
+    # Entries run by run and list by list, as numbers and as integers of the same memory. States are (12, S | 1, P).
+    n = 0
+    for s in range(valid.shape[0]):
+        start[s, 0] = n
+        for f in range(len(bounds) - 1):
+            for p in order[bounds[f] : bounds[f + 1]]:
+                if not valid[s, p]:
+                    continue
+                words[n, :_EXISTENCE] = states[:, s if states.shape[1] > 1 else 0, p]
+                words[n, _EXISTENCE] = 1.0
+                words[n, _CLASS:_CAPTURED] = 0.0
+                words[n, _CLASS + classes[p]] = 1.0
+                made_of = source.rows[source.start[p] : source.start[p + 1]]
+                words[n, _CAPTURED] = newest_of(source.valid[s], source.captured_s, made_of)
+                whose[n, _UNIT] = first_unit_of(source.valid[s], source.arrives_s, source.unit_ix, made_of)
+                whose[n, _TRACK] = -1
+                n += 1
+            start[s, f + 1] = n
 
 
 def as_fused_tracks(
