@@ -51,26 +51,24 @@ def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
     last = np.append(np.diff(ordered) > _TOLERANCE_S, True) if len(ordered) else np.empty(0, dtype=bool)
     issue_s = ordered[last]
     newest = np.full((len(issue_s), max(len(heard.units), 1)), -1)
-    superseded = out_of_sequence(heard)
-    for unit in range(len(heard.units)):
-        mine = arrived[(heard.frame_unit_ix[arrived] == unit) & ~superseded[arrived]]
-        at = np.searchsorted(arrives_s[mine], issue_s + _TOLERANCE_S, side="right") - 1
-        known = at >= 0
-        frame = mine[at[known]]
-        fresh = issue_s[known] <= arrives_s[frame] + max_age_s + _TOLERANCE_S
-        newest[np.flatnonzero(known)[fresh], unit] = frame[fresh]
+    frame = arrived[~out_of_sequence(heard)[arrived]]
+    instant = np.searchsorted(issue_s + _TOLERANCE_S, arrives_s[frame])
+    newest[instant, heard.frame_unit_ix[frame]] = frame  # of a unit's that arrive together the last
+    since = np.maximum.accumulate(np.where(newest >= 0, np.arange(len(issue_s))[:, None], 0), axis=0)
+    newest = np.take_along_axis(newest, since, axis=0)
+    outdated_s = arrives_s[newest] + max_age_s + _TOLERANCE_S
+    newest[issue_s[:, None] > outdated_s] = -1
     return FusionSchedule(issue_s, newest, arrived, np.append(0, np.flatnonzero(last) + 1))
 
 
 def out_of_sequence(heard: Tracks) -> Bool:
     """(F,) lists that arrive when a newer one of their unit is there already, or not at all."""
-    arrives_s = heard.common_arrives_s
+    arrives_s, unit = heard.common_arrives_s, heard.frame_unit_ix
     result: Bool = ~np.isfinite(arrives_s)
-    for unit in np.unique(heard.frame_unit_ix):
-        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(arrives_s))
-        # Of lists that arrive together the newest counts.
-        mine = mine[np.lexsort((-heard.stamp_ns[mine], arrives_s[mine]))]
-        stamps = heard.stamp_ns[mine]
-        before = np.maximum.accumulate(np.append(np.iinfo(np.int64).min, stamps[:-1])) if len(mine) else stamps
-        result[mine[stamps <= before]] = True
+    came = np.flatnonzero(~result)
+    # Unit by unit; of lists that arrive together the newest counts.
+    came = came[np.lexsort((-heard.stamp_ns[came], arrives_s[came], unit[came]))]
+    age = unit[came] * len(came) + np.unique(heard.stamp_ns[came], return_inverse=True)[1]
+    newest = np.maximum.accumulate(age)
+    result[came[1:][age[1:] <= newest[:-1]]] = True
     return result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -68,6 +68,10 @@ class FusedTracks:
             values = getattr(self.fused, name)
             columns[name] = np.zeros(len(rows)) if values is None else values[0, rows]
         return pd.DataFrame(columns)
+
+    def arriving(self, heard: Tracks, issue_s: Float) -> FusedTracks:
+        """The same of lists that only arrived at other times; `issue_s (F,)`: when the fused ones are available."""
+        return replace(self, heard=heard, fused=replace(self.fused, arrives_s=issue_s[None]))
 
     @cached_property
     def used(self) -> Int:

@@ -77,13 +77,15 @@ def capture_instants(heard: Tracks) -> Int:
 
 def shortest_period_s(heard: Tracks) -> float:
     """The shortest of the units' list periods (each the median between two captures), 0 where there is none."""
-    periods = []
-    came = np.isfinite(heard.common_arrives_s)
-    for unit in np.unique(heard.frame_unit_ix[came]):
-        captured_s = np.sort(heard.captured_s[(heard.frame_unit_ix == unit) & came])
-        if len(captured_s) > 1:
-            periods.append(float(np.median(np.diff(captured_s))))
-    return min(periods, default=0.0)
+    came = np.flatnonzero(np.isfinite(heard.common_arrives_s))
+    came = came[np.lexsort((heard.captured_s[came], heard.frame_unit_ix[came]))]
+    unit = heard.frame_unit_ix[came]
+    same = unit[1:] == unit[:-1]
+    steps_s, of = np.diff(heard.captured_s[came])[same], unit[1:][same]
+    steps_s = steps_s[np.lexsort((steps_s, of))]
+    _, first, count = np.unique(of, return_index=True, return_counts=True)
+    medians_s = (steps_s[first + (count - 1) // 2] + steps_s[first + count // 2]) / 2
+    return min(medians_s.tolist(), default=0.0)
 
 
 def _by_object(heard: Tracks, found: Episodes, arrives_s: Float) -> tuple[Int, Int]:
@@ -103,9 +105,10 @@ def _by_object(heard: Tracks, found: Episodes, arrives_s: Float) -> tuple[Int, I
 def _superseded_s(heard: Tracks) -> Float:
     """(F,) when the next list of the same unit arrives; inf for its last."""
     result = np.full(len(heard.stamp_ns), np.inf)
-    for unit in np.unique(heard.frame_unit_ix):
-        mine = np.flatnonzero((heard.frame_unit_ix == unit) & np.isfinite(heard.common_arrives_s))
-        result[mine[:-1]] = heard.common_arrives_s[mine[1:]]
+    came = np.flatnonzero(np.isfinite(heard.common_arrives_s))
+    came = came[np.argsort(heard.frame_unit_ix[came], kind="stable")]
+    same = heard.frame_unit_ix[came[1:]] == heard.frame_unit_ix[came[:-1]]
+    result[came[:-1][same]] = heard.common_arrives_s[came[1:][same]]
     return result
 
 
