@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -17,6 +17,17 @@ from copem_replay.core.view_geometry import ViewGeometry
 
 if TYPE_CHECKING:  # it takes long to import
     import pandas as pd
+
+
+class Sources(NamedTuple):
+    """Entries that units' lists hold, `valid (S, P)` and else (P,), and which of them make up each fused row."""
+
+    valid: Bool
+    captured_s: Float
+    arrives_s: Float
+    unit_ix: Int
+    entries: Int
+    start: Int
 
 
 @dataclass(frozen=True)
@@ -91,19 +102,27 @@ class FusedTracks:
         """(S, P) the newest capture that contributed to each row, −inf where none did."""
         if self.said is not None:
             return np.asarray(self.said["captured_s"], dtype=np.float64)[None]
-        newest_s = np.full(self.fused.valid.shape, -np.inf)
-        _newest(self.heard.valid, self.heard.row_captured_s, self.entries, self.start, newest_s)
-        return newest_s
+        return self._newest_and_first[0]
 
     @cached_property
     def first_unit_ix(self) -> Int:
         """(S, P) of the units that contributed to each row the one whose list arrived first; −1: none, or not said."""
         if self.said is not None:
             return np.asarray(self.said["unit_ix"], dtype=np.int64)[None]
-        first = np.full(self.fused.valid.shape, -1)
-        arrives_s = self.heard.common_arrives_s[self.heard.frame_ix]
-        _first_unit(self.heard.valid, arrives_s, self.heard.row_unit_ix, self.entries, self.start, first)
-        return first
+        return self._newest_and_first[1]
+
+    @cached_property
+    def _newest_and_first(self) -> tuple[Float, Int]:
+        newest_s, first = np.empty(self.fused.valid.shape), np.empty(self.fused.valid.shape, dtype=np.int64)
+        _of_each(self.sources, newest_s, first)
+        return newest_s, first
+
+    @property
+    def sources(self) -> Sources:
+        """What the rows are made of, for compiled code."""
+        heard = self.heard
+        arrives_s = heard.common_arrives_s[heard.frame_ix]
+        return Sources(heard.valid, heard.row_captured_s, arrives_s, heard.row_unit_ix, self.entries, self.start)
 
     @cached_property
     def _place(self) -> Int:
@@ -151,35 +170,21 @@ class FusedTracks:
 
 
 @nb.njit(cache=True, nogil=True)
-def newest_of(valid: Bool, captured_s: Float, entries: Int) -> float:
-    """The newest capture among the valid ones of some entries, −inf: none; `valid`, `captured_s` (P,)."""
-    newest_s = -np.inf
-    for entry in entries:
-        if valid[entry]:
-            newest_s = max(newest_s, captured_s[entry])
-    return newest_s
+def newest_and_first(of: Sources, s: int, p: int) -> tuple[float, int]:
+    """Of row p in run s the newest capture, −inf: none, and the unit whose list arrived first, −1: none."""
+    newest_s, first, best_s = -np.inf, -1, np.inf
+    for c in range(of.start[p], of.start[p + 1]):
+        entry = of.entries[c]
+        if of.valid[s, entry]:
+            newest_s = max(newest_s, of.captured_s[entry])
+            # Entries are in the order of units: of those that arrive together (within 1 µs) the first stays.
+            if of.arrives_s[entry] < best_s - 1e-6:
+                best_s, first = of.arrives_s[entry], of.unit_ix[entry]
+    return newest_s, first
 
 
 @nb.njit(cache=True, nogil=True)
-def first_unit_of(valid: Bool, arrives_s: Float, unit_ix: Int, entries: Int) -> int:
-    """The unit whose list arrived first of these, −1: none; `arrives_s`, `unit_ix` (P,)."""
-    first, best_s = -1, np.inf
-    for entry in entries:
-        # Entries are in the order of units: of those that arrive together (within 1 µs) the first stays.
-        if valid[entry] and arrives_s[entry] < best_s - 1e-6:
-            best_s, first = arrives_s[entry], unit_ix[entry]
-    return first
-
-
-@nb.njit(cache=True, nogil=True)
-def _newest(valid: Bool, captured_s: Float, entries: Int, start: Int, out: Float) -> None:
-    for s in range(out.shape[0]):
-        for p in range(out.shape[1]):
-            out[s, p] = newest_of(valid[s], captured_s, entries[start[p] : start[p + 1]])
-
-
-@nb.njit(cache=True, nogil=True)
-def _first_unit(valid: Bool, arrives_s: Float, unit_ix: Int, entries: Int, start: Int, out: Int) -> None:
-    for s in range(out.shape[0]):
-        for p in range(out.shape[1]):
-            out[s, p] = first_unit_of(valid[s], arrives_s, unit_ix, entries[start[p] : start[p + 1]])
+def _of_each(of: Sources, newest_s: Float, first: Int) -> None:
+    for s in range(newest_s.shape[0]):
+        for p in range(newest_s.shape[1]):
+            newest_s[s, p], first[s, p] = newest_and_first(of, s, p)

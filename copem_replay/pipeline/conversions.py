@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.fused_tracks import FusedTracks, first_unit_of, newest_of
+from copem_replay.core.fused_tracks import FusedTracks, Sources, newest_and_first
 from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists
 from copem_replay.core.tracks import NO_CAPTURE_NS, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.ideal import floored
@@ -20,29 +18,25 @@ def as_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
 
     Its truth ids are no tracks: it is not it that would confuse two objects.
     """
-    fused, heard = fused_tracks.fused, fused_tracks.heard
+    fused = fused_tracks.fused
     order, bounds = fused.by_frame
     start = np.zeros((len(fused.valid), len(bounds)), dtype=np.int64)
     entries = np.empty(int(fused.valid.sum()), dtype=ENTRY)
     states = np.stack(np.broadcast_arrays(*(getattr(fused, name) for name in VALUES), *floored(fused)))
-    source = _Contributions(
-        heard.valid, heard.row_captured_s, heard.row_unit_ix, heard.arrives_s[0, heard.frame_ix],
-        fused_tracks.entries, fused_tracks.start,
-    )  # fmt: skip
-    words = entries.view(np.float64).reshape(len(entries), -1)
+    words = entries.view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
     whose = entries.view(np.int64).reshape(words.shape)
-    _fill(fused.valid, order, bounds, states, scene.object_class[fused.row_object_ix], source, start, words, whose)
+    _fill(
+        fused.valid,
+        order,
+        bounds,
+        states,
+        scene.object_class[fused.row_object_ix],
+        fused_tracks.sources,
+        start,
+        words,
+        whose,
+    )
     return ObjectLists(start, entries)
-
-
-class _Contributions(NamedTuple):
-    # What fused rows are made of, as `FusedTracks` has it.
-    valid: Bool
-    captured_s: Float
-    unit_ix: Int
-    arrives_s: Float
-    rows: Int
-    start: Int
 
 
 _CAPTURED = ENTRY.itemsize // 8 - 3
@@ -54,7 +48,7 @@ _CLASS = _EXISTENCE + 1
 
 @nb.njit(cache=True, nogil=True)
 def _fill(
-    valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: _Contributions,
+    valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: Sources,
     start: Int, words: Float, whose: Int,
 ) -> None:  # fmt: skip
     # Entries run by run and list by list, as numbers and as integers of the same memory. States are (12, S | 1, P).
@@ -69,9 +63,7 @@ def _fill(
                 words[n, _EXISTENCE] = 1.0
                 words[n, _CLASS:_CAPTURED] = 0.0
                 words[n, _CLASS + classes[p]] = 1.0
-                made_of = source.rows[source.start[p] : source.start[p + 1]]
-                words[n, _CAPTURED] = newest_of(source.valid[s], source.captured_s, made_of)
-                whose[n, _UNIT] = first_unit_of(source.valid[s], source.arrives_s, source.unit_ix, made_of)
+                words[n, _CAPTURED], whose[n, _UNIT] = newest_and_first(source, s, p)
                 whose[n, _TRACK] = -1
                 n += 1
             start[s, f + 1] = n
