@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import orjson
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -23,7 +24,8 @@ OSI_TYPE: dict[str, tuple[int, int | None]] = {
 
 def rows_of(fused_tracks: FusedTracks, frame: int) -> list[int]:
     fused = fused_tracks.fused
-    return [p for p in range(len(fused.frame_ix)) if fused.frame_ix[p] == frame and fused.valid[0, p]]
+    rows: list[int] = np.flatnonzero((fused.frame_ix == frame) & fused.valid[0]).tolist()
+    return rows
 
 
 def name_of(scene: Scene, fused_tracks: FusedTracks, row: int) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import chain
@@ -50,6 +51,8 @@ OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
 RUN_RECORD = "org.copem_replay.run"
 """Our own record: what made the file."""
+CHUNK_BYTES = 1 << 20
+"""Of a file, before it is compressed (that of the library)."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's own record, and what in it counts the messages: no longer true of a copy with more of them."""
 
@@ -104,7 +107,7 @@ def write_mcap(
         chunks = chain([begun], ([*lists_of(c), *besides(c)] for c in rest))
         added = _in_order([chain.from_iterable(_in_order(streams) for streams in chunks), *shown])
         _add_records(writer, original, family, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
-        for message in _in_order([messages, added]):
+        for message in _made_ahead(_in_order([messages, added])):
             writer.add_message(
                 message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
             )
@@ -155,6 +158,25 @@ def _truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
 
 def _in_order(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:
     return heapq.merge(*streams, key=lambda m: m.log_time)
+
+
+def _made_ahead(messages: Iterator[Message]) -> Iterator[Message]:
+    """The same, a chunk of the file ahead in a thread of their own: compiled code and compression share no lock."""
+    with ThreadPoolExecutor(1) as thread:
+        next_ones = thread.submit(_some, messages)
+        while made := next_ones.result():
+            next_ones = thread.submit(_some, messages)
+            yield from made
+
+
+def _some(messages: Iterator[Message]) -> list[Message]:
+    made, size = [], 0
+    for message in messages:
+        made.append(message)
+        size += len(message.data)
+        if size > CHUNK_BYTES:
+            break
+    return made
 
 
 def _lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]) -> Iterator[Message]:
