@@ -146,6 +146,9 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
         yield source.at(("sweep", "ghosts_in_list"), "no PEM has `ghosts: […]`")
     if sweep.get("correlation_s") and not any(_memories(data, name, "detection") for name in _names(data.get("pems"))):
         yield source.at(("sweep", "correlation_s"), "no PEM has `memory: {detection: […]}`")
+    for kind in ("loss", "burst_s"):
+        if sweep.get(kind):
+            yield from _swept_links(source, kind, sweep[kind])
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
     counts = sweep.get("units")
     for k, count in enumerate(counts if isinstance(counts, list) else []):
@@ -153,6 +156,27 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             yield source.at(
                 ("sweep", "units", k), f"expected at most {others}, the units beside the ego's; found {count}"
             )
+
+
+def _swept_links(source: Source, kind: str, values: object) -> Iterator[str]:
+    """Links whose loss is no one number to vary, or that cannot have it; that there are none."""
+    found = False
+    for name, link in _items(source.data.get("links")):
+        reception, memory = link.get("reception"), link.get("memory")
+        of = reception.get("kind") if isinstance(reception, dict) else "constant"
+        if kind == "loss" and of not in ("constant", "gilbert_elliott"):
+            message = f"links.{name}.reception: the loss of {of} is none to vary; use constant or gilbert_elliott"
+            yield source.at(("sweep", kind), message)
+        found |= kind == "loss" or of == "gilbert_elliott" or (isinstance(memory, dict) and "reception" in memory)
+        if kind == "loss" and of == "gilbert_elliott" and isinstance(reception, dict):
+            low, high = reception.get("good_loss", 0.0), reception.get("bad_loss", 1.0)
+            for k, value in enumerate(values if isinstance(values, list) else []):
+                if all(isinstance(one, int | float) for one in (low, high, value)) and not low <= value <= high:
+                    message = f"expected between good_loss and bad_loss of {name} ({low:g} … {high:g}), found {value:g}"
+                    yield source.at(("sweep", kind, k), message)
+    if not found:
+        what = "no link loses lists" if kind == "loss" else "no link has bursts (gilbert_elliott, or memory.reception)"
+        yield source.at(("sweep", kind), what)
 
 
 def _settings(source: Source, data: dict[str, Any], units: Sequence[str], pems: Sequence[str]) -> Iterator[str]:

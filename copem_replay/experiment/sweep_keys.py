@@ -47,6 +47,8 @@ class SweptBy(Frozen):
     penetration_rate: SweptNames | None = None
     correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
     ghosts_in_list: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+    loss: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+    burst_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
 
 
 def _swept_by(value: object) -> str:
@@ -63,7 +65,9 @@ class Sweep(Frozen):
     `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
     `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
     how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
-    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average.
+    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average. `loss`: the
+    share of lists that links lose; `burst_s`: how long losses last, `bad_lasts_s` or else the first part of
+    `memory.reception`.
     """
 
     configurations: Swept | None = None
@@ -75,6 +79,12 @@ class Sweep(Frozen):
         default=None, exclude_if=lambda values: values is None
     )
     ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
+    loss: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
+        default=None, exclude_if=lambda values: values is None
+    )
+    burst_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
         default=None, exclude_if=lambda values: values is None
     )
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from copem_replay.metrics.accuracy.statistics import Total
+    from copem_replay.metrics.link_times import LinkTimes
     from copem_replay.metrics.output_times import OutputTimes
 
 Value = float | int | str | None
@@ -35,8 +36,8 @@ class Given:
 
     `rows`: its rows of `tally.parquet` of being detected, log by log; `conflicts`: of a collision being implied, None
     where that is not asked for. `lists_fixed`, `reaction_fixed`: known alike, braking alike in every run. `accuracy`,
-    `exact`: None where the experiment asks for neither. `output`: of a stack's recorded output. `own`: sums of own
-    metrics, by name.
+    `exact`: None where the experiment asks for neither. `output`: of a stack's recorded output. `link`: of the lists
+    that come by one. `own`: sums of own metrics, by name.
     """
 
     rows: pd.DataFrame
@@ -49,6 +50,7 @@ class Given:
     exact: pd.DataFrame | None = None  # its rows of exact.parquet
     output: OutputTimes | None = None
     conflicts: pd.DataFrame | None = None
+    link: LinkTimes | None = None
     own: Mapping[str, OwnSums] = field(default_factory=dict)
 
 

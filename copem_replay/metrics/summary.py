@@ -14,6 +14,7 @@ from copem_replay.metrics.accuracy.metrics import beyond_gate_share
 from copem_replay.metrics.accuracy.statistics import Total
 from copem_replay.metrics.fixed import Fixed
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
+from copem_replay.metrics.link_times import LinkTimes
 from copem_replay.metrics.metric import Given, OwnSums, RowMetric, own_metrics, own_sums, values
 from copem_replay.metrics.output_times import OutputTimes
 from copem_replay.metrics.summary_metrics import METRICS
@@ -75,13 +76,14 @@ def summary_of(
     sums: Sums | None = None,
     outputs: Mapping[str, OutputTimes] | None = None,
     conflicts_asked: bool = False,
+    links: Mapping[str, LinkTimes] | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """The rows of `summary.csv`, and what has to be said about them, of the rows of `tally.parquet`.
 
     `exact`: the rows of `exact.parquet`. `accuracy`: by configuration the sums its figures are made of.
     `fixed`: what is the same in every run; None: nothing. `own`: the experiment's own metrics, whose columns come last,
-    and `sums`, what they are made of. `outputs`: how old the recorded outputs are, by configuration.
-    `conflicts_asked`: whether it is measured when lists imply a collision.
+    and `sums`, what they are made of. `outputs`: how old the recorded outputs are, by configuration; `links`: what
+    becomes of lists, of those with a link. `conflicts_asked`: whether it is measured when lists imply a collision.
     """
     notes: list[str] = []
     fixed = fixed or Fixed()
@@ -112,6 +114,7 @@ def summary_of(
             output=(outputs or {}).get(name),
             conflicts=conflicts.get(name, implied.iloc[:0]) if conflicts_asked else None,
             own=(sums or {}).get(name, {}),
+            link=(links or {}).get(name),
         )
         rows.append({"configuration": name, **values(columns, given)})
     return pd.DataFrame(rows), notes

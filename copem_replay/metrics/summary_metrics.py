@@ -22,6 +22,7 @@ from copem_replay.metrics.braking.driver import UNRESOLVED
 from copem_replay.metrics.end_reason import competes
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.intervals import clusters, resamples, share_limits, wilson
+from copem_replay.metrics.link_times import LINK
 from copem_replay.metrics.metric import Given, Metric
 from copem_replay.metrics.output_times import OUTPUT
 from copem_replay.metrics.survival import (
@@ -306,7 +307,7 @@ _EXACT_METRICS = (
 )
 
 METRICS: tuple[Metric, ...] = (
-    *_DETECTION_METRICS, *_CONFLICT_METRICS, *_BRAKING_METRICS, *ACCURACY, *OUTPUT, *_EXACT_METRICS,
+    *_DETECTION_METRICS, *_CONFLICT_METRICS, *_BRAKING_METRICS, *ACCURACY, *OUTPUT, *LINK, *_EXACT_METRICS,
 )  # fmt: skip
 """All built-in metrics, in the order of the columns."""
 METRIC: dict[str, Metric] = {metric.name: metric for metric in METRICS}
@@ -317,6 +318,7 @@ PARTS = {
     "conflict": "When the collision was foreseen",
     "accuracy": "How far off",
     "lists": "What the lists hold",
+    "link": "What links make of lists",
     "output": "How old a recorded output is",
     "own": "Own metrics",
 }

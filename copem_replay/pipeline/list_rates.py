@@ -1,40 +1,68 @@
-"""How often the receiver of each configuration issues a fused list."""
+"""How often the receiver of each configuration issues a fused list, and what its links make of the lists it is sent."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from copem_replay.communication.arrivals import fusion_schedule
-from copem_replay.core.tracks import SAME_INSTANT_NS, Int
+from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Float, Int
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.link_times import LinkTimes, link_times
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
-def list_rates(replay: Replay, experiment: Experiment) -> dict[str, tuple[int, float]]:
-    """For each configuration how many intervals there are between fused lists issued while the log lasts, and the
-    seconds they cover.
+@dataclass(frozen=True)
+class ListTimes:
+    """Of one configuration: intervals between fused lists while a log lasts, the seconds they cover, and its links."""
 
-    Units that only some runs have are taken to be there. Where arrivals differ it is all runs together.
+    intervals: int
+    covered_s: float
+    links: LinkTimes | None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Fused lists per second; None: there are no two."""
+        return self.intervals / self.covered_s if self.covered_s > 0 else None
+
+
+def list_times(replay: Replay, experiment: Experiment) -> dict[str, list[ListTimes]]:
+    """By configuration what there is of each run, or of the one that stands for all.
+
+    Units that only some runs have are taken to be there.
     """
     world = replay.lists_only(experiment)
-    of_run = []
+    result: dict[str, list[ListTimes]] = {}
     for run in range(experiment.runs if world.experiment.arrivals_differ else 1):
         alone = np.array([run])
-        of_run.append(_rates(replace(world, on_air=replay.on_air(experiment, alone)), alone))
-    return {name: (sum(r[name][0] for r in of_run), sum(r[name][1] for r in of_run)) for name in of_run[0]}
+        _add(result, replace(world, on_air=replay.on_air(experiment, alone)), alone)
+    return result
 
 
-def _rates(world: WorldChunk, run: Int) -> dict[str, tuple[int, float]]:
-    """Of one run (1,)."""
-    rates, seen = {}, seen_by_all(world, run, states="true")
+def together(times: Iterable[ListTimes]) -> ListTimes:
+    """All runs and logs of a configuration as one."""
+    every = list(times)
+    links = [one.links for one in every if one.links is not None]
+    added = sum(links[1:], links[0]) if links else None
+    return ListTimes(sum(one.intervals for one in every), sum(one.covered_s for one in every), added)
+
+
+def _add(result: dict[str, list[ListTimes]], world: WorldChunk, run: Int) -> None:
+    """The configurations in one run (1,)."""
+    seen, end_s = seen_by_all(world, run, states="true"), world.scene.end_s
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world, name)
-        issue_s = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s
-        issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= world.scene.end_s + _TOLERANCE_S)]
-        rates[name] = (len(issue_s) - 1, float(issue_s[-1] - issue_s[0])) if len(issue_s) > 1 else (0, 0.0)
-    return rates
+        issue_s: Float = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s
+        issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= end_s + _TOLERANCE_S)]
+        covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
+        linked = [unit for unit in heard.units if configuration.link_of(unit) is not None]
+        links = None
+        if linked:
+            sent = world.truth if configuration.units == TRUTH else seen
+            links = link_times(sent, heard, linked, end_s)
+        result.setdefault(name, []).append(ListTimes(max(len(issue_s) - 1, 0), covered_s, links))

@@ -22,7 +22,7 @@ from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_table
 from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
 from copem_replay.pipeline.closed_form import check_exact, exact_table
 from copem_replay.pipeline.cost import Cost, watched
-from copem_replay.pipeline.list_rates import list_rates
+from copem_replay.pipeline.list_rates import ListTimes, list_times, together
 from copem_replay.pipeline.memory import memory_notes
 from copem_replay.pipeline.notes import notes_of, same_instants
 from copem_replay.pipeline.output_times import output_times
@@ -77,10 +77,11 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
     table, parts, order = tables.of(ready, experiment)
     tallied = tally(table)
     horizon = horizon_s(tallied, experiment.measure.horizon_s)
+    times = _times(ready, experiment)
     rows, said = summary_of(
         tallied,
         list(experiment.configurations),
-        _rates(ready, experiment),
+        {name: one.rate_hz for name, one in times.items()},
         seed=experiment.seed,
         horizon_s=horizon,
         exact=exact,
@@ -90,6 +91,7 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
         sums=own_sums_of(table, experiment.measure.metrics),
         outputs=output_times(recordings, experiment),
         conflicts_asked=experiment.measure.conflict is not None,
+        links={name: one.links for name, one in times.items() if one.links is not None},
     )
     swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
     notes = notes_of(recordings, ready, experiment, replayed=True)
@@ -116,16 +118,18 @@ def _at_point(
     if not point.same_units:
         ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
     table, parts, _ = tables.of(ready, experiment)
+    times = _times(ready, experiment)
     rows, _ = summary_of(
         tally(table),
         list(experiment.configurations),
-        _rates(ready, experiment),
+        {name: one.rate_hz for name, one in times.items()},
         seed=experiment.seed,
         horizon_s=horizon,
         exact=_exactly(ready, experiment),
         accuracy=totals(parts),
         fixed=fixed_in(experiment.as_written()),
         conflicts_asked=experiment.measure.conflict is not None,
+        links={name: one.links for name, one in times.items() if one.links is not None},
     )
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)
@@ -178,14 +182,9 @@ def _order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> NDAr
     return np.lexsort((table["run"].to_numpy(), configuration, log))
 
 
-def _rates(ready: Sequence[Replay], experiment: Experiment) -> dict[str, float | None]:
-    rates = [list_rates(replay, of_log(experiment, replay.scene.log)) for replay in ready]
-    return {name: _rate([one[name] for one in rates if name in one]) for name in experiment.configurations}
-
-
-def _rate(intervals: Sequence[tuple[int, float]]) -> float | None:
-    count, span_s = sum(n for n, _ in intervals), sum(s for _, s in intervals)
-    return count / span_s if span_s > 0 else None
+def _times(ready: Sequence[Replay], experiment: Experiment) -> dict[str, ListTimes]:
+    of_logs = [list_times(replay, of_log(experiment, replay.scene.log)) for replay in ready]
+    return {name: together(one for log in of_logs for one in log.get(name, ())) for name in experiment.configurations}
 
 
 def log_path_of(recordings: Sequence[Recording], log: str) -> Path:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from copem_replay.communication.link import LinkModel
 from copem_replay.core.memory import Memory
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
@@ -20,8 +21,9 @@ from copem_replay.fusion.base import ListFusion
 from copem_replay.metrics.config import Measure
 from copem_replay.perception.config import Carriers
 from copem_replay.perception.pem.model import Pem
+from copem_replay.pipeline.swept_links import link_at, varies
 
-KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s", "ghosts_in_list")
+KINDS = ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s", "ghosts_in_list", "loss", "burst_s")
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Point:
     @property
     def same_units(self) -> bool:
         """Whether what is prepared for the experiment serves this point, too."""
-        return self.sweep in ("latency_s", "units", "correlation_s", "ghosts_in_list")
+        return self.sweep not in ("rate_hz", "penetration_rate")
 
 
 def points(experiment: Experiment) -> Iterator[Point]:
@@ -51,6 +53,7 @@ def points(experiment: Experiment) -> Iterator[Point]:
                     "configurations": {name: c for name, curve in curves.items() if (c := curve[k]) is not None},
                     "units": _units_at(experiment.units, kind, value),
                     "pems": _pems_at(experiment.pems, kind, value),
+                    "links": {name: link_at(link, kind, value) for name, link in experiment.links.items()},
                     "sweep": None,
                     "measure": _measured(experiment),
                 }
@@ -132,6 +135,9 @@ def _concerns(experiment: Experiment, configuration: Configuration, kind: str) -
         return any(not _is_ego(unit) for unit in units)
     if kind == "latency_s" and isinstance(configuration.latency_s, dict):
         return any(name not in configuration.latency_s for name in experiment.units_of(configuration))
+    if kind in ("loss", "burst_s"):
+        links = [configuration.link_of(name) for name in experiment.units_of(configuration)]
+        return any(varies(experiment.links[one] if isinstance(one, str) else one, kind) for one in links)
     if kind == "rate_hz":
         return any(unit.recorded is None for unit in units)
     if kind == "correlation_s":
@@ -154,6 +160,8 @@ def _configuration_at(
         by_unit = configuration.latency_s
         late = by_unit | {"default": value} if isinstance(by_unit, dict) else value
         return configuration.model_copy(update={"latency_s": late})
+    if kind in ("loss", "burst_s") and isinstance(configuration.link, LinkModel):
+        return configuration.model_copy(update={"link": link_at(configuration.link, kind, value)})
     if kind != "units":
         return configuration
     heard = experiment.units_of(configuration)

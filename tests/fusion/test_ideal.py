@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from copem_replay.communication.arrivals import fusion_schedule
-from copem_replay.communication.link import ConstantLink, transmit
+from copem_replay.communication.link import ConstantLink, UnitLinks, transmit
 from copem_replay.core.tracks import UNCERTAINTIES, VALUES, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.ideal import draw_posterior, fuse
@@ -292,7 +292,7 @@ def run_tracks(probability: float, log: Recording, without: int = -1) -> dict[st
     result = {}
     for combine in ("samples", "posterior"):
         seen = perceive(log.scene, found, plan, RUNS, states="sampled" if combine == "samples" else "expected")
-        fused_tracks = fuse(transmit(seen, ConstantLink(), "link"), max_age_s=1.0, without_object_ix=without)
+        fused_tracks = fuse(transmit(seen, [UnitLinks("link", ConstantLink())]), max_age_s=1.0, without_object_ix=without)
         drawn = draw_posterior(fused_tracks, log.scene, plan.seed, RUNS) if combine == "posterior" else fused_tracks
         result[combine] = drawn.fused
     return result

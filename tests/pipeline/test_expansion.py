@@ -32,7 +32,7 @@ from copem_replay.pipeline.accuracy_tables import with_accuracy
 from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.closed_form import distributions, exact_table
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand, of_run
-from copem_replay.pipeline.list_rates import list_rates
+from copem_replay.pipeline.list_rates import list_times
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 from tests.helpers.experiments import changed, source_of
@@ -324,7 +324,7 @@ class TestRuns:
         )
         log = on_the_move()
         pd.testing.assert_frame_equal(run(whole, [log]).table, run(each, [log]).table, check_exact=True)
-        assert list_rates(prepare(log, whole), whole) == list_rates(prepare(log, each), each)
+        assert list_times(prepare(log, whole), whole) == list_times(prepare(log, each), each)
 
     @pytest.mark.parametrize(
         ("confirm", "accuracy"), [(CONFIRMS[0], True), *((confirm, False) for confirm in CONFIRMS)]

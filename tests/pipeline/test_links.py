@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,16 @@ import pytest
 
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Tracks
+from copem_replay.experiment.file import plain as filed
 from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline import chunking
 from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import listen, seen_by_all
 from copem_replay.pipeline.run import Result, run
+from copem_replay.pipeline.sweep import points
 from tests.helpers import scenes
 from tests.helpers.scenes import Thing, driving, experiment, standing
 
@@ -108,7 +112,8 @@ def test_configurations_have_the_same_numbers() -> None:
     came = east & np.isfinite(coop.common_arrives_s)
     np.testing.assert_allclose((coop.common_arrives_s - none.common_arrives_s)[came], 0.1, atol=1e-12)
     ready_s = (none.common_arrives_s - none.captured_s)[east]
-    assert (ready_s.min() > 0.02) and len(np.unique(ready_s)) == len(ready_s)
+    assert ready_s.min() > 0.02
+    assert len(np.unique(ready_s)) == len(ready_s)
     np.testing.assert_array_equal(heard_by(some, "one", 1).captured_s, one.captured_s)
     assert (heard_by(some, "none", 1).common_arrives_s[east] != none.common_arrives_s[east]).all()
 
@@ -164,7 +169,7 @@ def test_nothing_is_known_sooner_than_without_the_link() -> None:
 def one_car(loss: float, **configuration: Any) -> Experiment:
     """The oncoming car is within 60 m from the list of 4 s on, and surely in it; lists come ten a second."""
     return experiment(
-        links={"v2x": {"reception": {"kind": "constant", "probability": 1 - loss}}}, runs=3000,
+        links={"v2x": {"reception": {"kind": "constant", "probability": 1 - loss}}}, runs=600,
         configurations={"PEM": {"units": ["ego"], "link": "v2x", **configuration}}, show=None,
         measure={"onset": {"kind": "in_range", "range_m": 80}, "exact": True, "accuracy": False},
     )  # fmt: skip
@@ -176,13 +181,13 @@ def test_mean_delay_by_loss_and_its_closed_form(loss: float) -> None:
     result = run(one_car(loss), [scenes.oncoming_car()])
     late_s = result.table["detection_s"] - 4.0
     expected_s = 0.1 * loss / (1 - loss)
-    assert late_s.mean() == pytest.approx(expected_s, abs=4 * late_s.std() / math.sqrt(3000))
+    assert late_s.mean() == pytest.approx(expected_s, abs=4 * late_s.std() / math.sqrt(600))
     assert result.exact is not None
     exact = result.exact[result.exact["probability"] > 0]
     k = np.rint((exact["detection_s"].to_numpy()[:-1] - 4.0) / 0.1)
     np.testing.assert_allclose(exact["probability"].to_numpy()[:-1], (1 - loss) * loss**k, rtol=1e-9)
-    counted = np.bincount(np.rint(late_s / 0.1).astype(int), minlength=3)[:3] / 3000
-    np.testing.assert_allclose(counted, (1 - loss) * loss ** np.arange(3), atol=4 * math.sqrt(0.25 / 3000))
+    counted = np.bincount(np.rint(late_s / 0.1).astype(int), minlength=3)[:3] / 600
+    np.testing.assert_allclose(counted, (1 - loss) * loss ** np.arange(3), atol=4 * math.sqrt(0.25 / 600))
 
 
 def test_fused_lists_are_issued_at_ticks() -> None:
@@ -197,8 +202,10 @@ def test_fused_lists_are_issued_at_ticks() -> None:
 @pytest.mark.parametrize(
     ("link", "unit", "said"),
     [
-        ({"latency": GAMMA}, {}, "link v2x: latency is drawn, and then lists have no common instants; use a constant one"),
-        ({"channel": {"kbps": 100}}, {}, "link v2x: lists queue, each as long as the lists before it are; use no `channel`"),
+        ({"latency": GAMMA}, {},
+         "link v2x: latency is drawn, and then lists have no common instants; use a constant one"),
+        ({"channel": {"kbps": 100}}, {},
+         "link v2x: lists queue, each as long as the lists before it are; use no `channel`"),
         (BURSTS, {}, "link v2x: losses come in bursts, and lists are then lost together; use a constant reception"),
         ({"reception": {"kind": "constant", "probability": 0.5},
           "memory": {"reception": [{"share": 1, "correlation_s": 1}]}}, {},
@@ -226,3 +233,96 @@ def test_without_a_receiver_there_is_no_distance() -> None:
         "links.v2x.reception: shadowing: nobody knows the distance to a receiver, the log has no ego; use constant"
     )
     assert str(caught.value) == f"scene: {expected}"
+
+
+def test_what_links_make_of_lists_is_in_the_summary() -> None:
+    """At 10 Hz and .1 s late, the newest list is between .1 and .2 s old, one age as long as another."""
+    link = {"latency": 0.1}
+    some = one_car(0.0, latency_s=0.0).model_copy(update={"runs": 1})
+    plain = Experiment.model_validate(some.as_written() | {"links": {"v2x": link}})
+    [row] = run(plain, [scenes.oncoming_car()]).summary.to_dict("records")
+    assert (row["lost_share"], row["overtaken_share"]) == (0.0, 0.0)
+    assert row["age_of_information_p50_s"] == pytest.approx(0.15, abs=1e-6)
+    assert row["age_of_information_p95_s"] == pytest.approx(0.195, abs=1e-6)
+    [none] = run(experiment(configurations={"PEM": {"units": ["ego"]}}), [scenes.oncoming_car()]).summary.to_dict(
+        "records"
+    )
+    assert "lost_share" not in none
+
+
+def test_lists_of_wired_units_are_none_of_the_links() -> None:
+    slow = {
+        "latency": {"kind": "gamma", "mean_s": 0.2, "shape": 1},
+        "reception": {"kind": "constant", "probability": 0.5},
+    }
+    wired = {"coop": {"units": "all", "link": {"default": "slow", "ego": "none"}}}
+    some = plan(None, links={"slow": slow}, configurations=wired, runs=30)
+    heard = [heard_by(some, one=k) for k in range(30)]
+    sent = [one.common_arrives_s[one.frame_unit_ix > 0] for one in heard]
+    [row] = run(some, [traffic()]).summary.to_dict("records")
+    assert row["lost_share"] == np.mean([np.isinf(one).mean() for one in sent])
+    assert row["lost_share"] == pytest.approx(0.5, abs=0.04)
+    overtaken, came = 0, 0
+    for one in heard:  # arrived after a newer one of its unit
+        for unit in (1, 2):
+            mine = np.flatnonzero((one.frame_unit_ix == unit) & np.isfinite(one.common_arrives_s))
+            at = one.common_arrives_s[mine]
+            overtaken += sum((at[k + 1 :] <= at[k]).any() for k in range(len(at)))
+            came += len(at)
+    assert row["overtaken_share"] == pytest.approx(overtaken / came)
+    assert overtaken / came > 0.1
+
+
+SWEPT = {
+    "loss": ([0.0, 0.2, 0.6], {"reception": {"kind": "gilbert_elliott", "bad_share": 0.4, "bad_lasts_s": 0.5}}),
+    "burst_s": ([0.0, 0.5, 3.0], {"reception": {"kind": "constant", "probability": 0.6},
+                                  "memory": {"reception": [{"share": 1.0, "correlation_s": 1.0}]}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", list(SWEPT))
+def test_sweeps_of_links(kind: str) -> None:
+    """More loss only removes lists, run by run; bursts leave the mean loss as it is."""
+    values, link = SWEPT[kind]
+    some = plan("v2x", links={"v2x": link}, runs=3, sweep={kind: values, "configurations": ["coop"]})
+    swept = list(points(some))
+    assert [point.value for point in swept] == values
+    came = [[np.isfinite(heard_by(at.experiment, one=k).common_arrives_s) for k in range(3)] for at in swept]
+    if kind == "loss":
+        assert all((more <= less).all() for k in range(3) for less, more in pairwise(one[k] for one in came))
+        assert np.all(came[0])
+    rows = run(some, [traffic()]).sweep
+    assert rows is not None
+    lost = rows["lost_share"].to_numpy()
+    np.testing.assert_allclose(lost, values if kind == "loss" else [0.4] * 3, atol=0.15)
+
+
+@pytest.mark.parametrize(
+    ("link", "sweep", "said"),
+    [
+        ({"reception": RADIO["reception"]}, {"loss": [0.1]},
+         "sweep.loss: links.v2x.reception: the loss of shadowing is none to vary; use constant or gilbert_elliott"),
+        ({"reception": {"kind": "gilbert_elliott", "bad_share": 0.1, "bad_lasts_s": 1.0, "bad_loss": 0.6}},
+         {"loss": [0.2, 0.8]},
+         "sweep.loss[1]: expected between good_loss and bad_loss of v2x (0 … 0.6), found 0.8"),
+        ({"latency": 0.1}, {"burst_s": [1]},
+         "sweep.burst_s: no link has bursts (gilbert_elliott, or memory.reception)"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_swept_is_said(link: dict[str, Any], sweep: dict[str, Any], said: str) -> None:
+    data = plan("v2x", links={"v2x": link}).as_written() | {"sweep": sweep}
+    assert [f"experiment: {said}"] == [line for line in problems(filed(data))[1] if "sweep" in line]
+
+
+def test_a_link_that_there_is_not() -> None:
+    data = plan("v2x").as_written()
+    data["configurations"] = {
+        "coop": {"units": "all", "link": "v2y"},
+        "two": {"units": "all", "link": {"nobody": "v2x"}},
+    }
+    del data["links"]["bursts"]
+    found = [line for line in problems(filed(data))[1] if "link" in line]
+    assert found == [
+        "experiment: configurations.coop.link: no link 'v2y' (there is v2x)",
+        "experiment: configurations.two.link.nobody: no unit is named 'nobody'; there are ego, east, west, default",
+    ]

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from copem_replay.cli import main as cli
-from copem_replay.communication.link import ConstantLink, transmit
+from copem_replay.communication.link import ConstantLink, UnitLinks, transmit
 from copem_replay.core.object_list import ENTRY, ObjectLists
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.base import ListFusion, fused_by
@@ -105,7 +105,7 @@ class TestWhatDoesNotMatter:
         world = prepare(crowd(), plan).world(plan)
         seen = seen_by_all(world, runs, states="sampled")
         lists = _without_truth(world, seen, runs)
-        heard = transmit(seen, ConstantLink(latency_s=latency_s), "link")
+        heard = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
         told = inputs(heard, lists, max_age_s=1.0)
         rng = np.random.default_rng(0)
         names = tuple(told.units[k] for k in (2, 0, 1))

@@ -18,7 +18,7 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.communication.link import transmit
+from copem_replay.communication.link import UnitLinks, transmit
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.file import load, parse
 from copem_replay.experiment.schema import Experiment
@@ -202,7 +202,7 @@ def test_own_error_model_of_the_architecture_page_works(architecture: ModuleType
 
 def test_own_link_of_the_architecture_page_works(architecture: ModuleType) -> None:
     filling = architecture.Filling(kind="page:Filling", per_s=0.5)
-    late = transmit(scenes.oncoming_car().truth, filling, "link")
+    late = transmit(scenes.oncoming_car().truth, [UnitLinks("link", filling)])
     assert late.arrives_s[0, [0, 40, 80]] == pytest.approx([0.0, 6.0, 12.0])
 
 

@@ -34,6 +34,8 @@ AXES = {
     "penetration_rate": "Share of vehicles that carry a unit",
     "correlation_s": "Correlation time of detection (s)",
     "ghosts_in_list": "Ghosts in a list of a unit",
+    "loss": "Share of lists that are lost",
+    "burst_s": "How long losses last (s)",
 }
 _ROWS = {
     "pass_share": "Share that passes",
