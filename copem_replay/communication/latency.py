@@ -102,6 +102,7 @@ LATENCIES = {
     "constant": "copem_replay.communication.latency:ConstantLatency",
     "gamma": "copem_replay.communication.latency:GammaLatency",
     "lognormal": "copem_replay.communication.latency:LognormalLatency",
+    "recorded": "copem_replay.experiment.recorded_latency:RecordedLatency",  # reads recordings
 }
 
 

@@ -129,8 +129,8 @@ class Slot:
     def __get_pydantic_core_schema__(self, source: type[Any], handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         """Validation: find the class that `kind` names and let it validate the rest."""
         self.base = source
-        return core_schema.no_info_plain_validator_function(
-            self.build,
+        return core_schema.with_info_plain_validator_function(
+            lambda value, info: self.build(value, info.context),
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda c: c.model_dump(mode="json", by_alias=True)
             ),
@@ -187,8 +187,8 @@ class Slot:
             raise _problem(f"kind: {kind!r} lacks {lacking}")
         return component
 
-    def build(self, value: object) -> Component:
-        """A component from what the experiment says of it."""
+    def build(self, value: object, context: Mapping[str, Any] | None = None) -> Component:
+        """A component from what the experiment says of it. `context`: what validators are told, such as the folder."""
         if isinstance(value, Component):
             return value
         if self.default is not None and isinstance(value, Mapping) and "kind" not in value:
@@ -199,7 +199,7 @@ class Slot:
             raise _problem(f"expected {{kind: …}}, kind {kinds}; found {found}")
         component = self.find(value["kind"])
         try:
-            return component.model_validate(dict(value))
+            return component.model_validate(dict(value), context=context)
         except ValidationError:
             raise
         except FAILURES as error:  # of a constructor of the user's

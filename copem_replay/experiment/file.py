@@ -113,7 +113,9 @@ def parse(source: Source) -> tuple[Experiment | None, list[str]]:
     """The experiment, or None, and every problem of its shape."""
     problems = list(source.problems)
     try:
-        experiment = Experiment.model_validate(source.data)
+        # What a plain experiment names is relative to where we are.
+        folder = None if isinstance(source, PlainSource) else source.path.parent
+        experiment = Experiment.model_validate(source.data, context={"folder": folder})
     except ValidationError as error:
         found = list(_problems(source, error))
         first = sum(line == source.at(("version",), "missing") for line in found)  # in the order of the keys

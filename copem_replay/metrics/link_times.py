@@ -17,7 +17,7 @@ from copem_replay.metrics.metric import Given, Metric
 class LinkTimes:
     """Sums over the lists that units make: how many, lost, arrived, and overtaken by a newer one of their unit.
 
-    `from_s`, `to_s (N,)`: between which ages the newest list of a unit that has arrived grew older, one after the other.
+    `from_s`, `to_s (N,)`: between which ages the newest list of a unit that has arrived grew older, piece by piece.
     """
 
     sent: int
@@ -42,7 +42,7 @@ class LinkTimes:
 
 
 def link_times(seen: Tracks, heard: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
-    """Of the lists that some units send in one run: `seen` as they are sent, `heard` as they arrive, until a log's end."""
+    """Of lists that some units send in one run, `seen` as they are sent and `heard` as they arrive, to a log's end."""
     arrives_s, late = heard.common_arrives_s, out_of_sequence(heard)
     made = np.isfinite(seen.common_arrives_s)
     made &= np.array([name in units for name in heard.units], dtype=bool)[heard.frame_unit_ix]

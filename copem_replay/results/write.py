@@ -111,6 +111,8 @@ def _fill(
     """Write all files but the provenance. Returns notes for the user."""
     data, scratch = resolved(experiment).as_written(), place.new
     data["logs"] = _entries(experiment.logs, recordings, place.folder)
+    for of in _recorded_latencies(data):
+        of["file"] = os.path.relpath(of["file"], place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
     write_parquet(result.table, scratch / "detections.parquet")
     write_parquet(result.tally, scratch / "tally.parquet")
@@ -130,6 +132,14 @@ def _fill(
             said = [line for exporter in exporters for line in exporter.write(Path(f"{target}{exporter.suffix}"), run)]
             notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
     return notes
+
+
+def _recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """The latencies of an experiment, as plain data, that are read off files."""
+    configurations = [c.get("link") for c in data["configurations"].values()]
+    links = [link for link in (*data.get("links", {}).values(), *configurations) if isinstance(link, dict)]
+    found = [*(link.get("latency") for link in links), *(unit.get("ready") for unit in data["units"].values())]
+    return [one for one in found if isinstance(one, dict) and one.get("kind") == "recorded"]
 
 
 def _entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
+import copem_replay as cr
 from copem_replay.communication.latency import Delay, LatencyModel
 from copem_replay.communication.link import Air, SentLists
 from copem_replay.communication.radio import Radio
@@ -265,3 +268,57 @@ def test_a_reception_of_the_users_own() -> None:
 def test_what_is_no_link_is_refused(keys: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         radio(**keys)
+
+
+class TestRecorded:
+    def test_a_column_has_its_own_distribution(self, tmp_path: Path) -> None:
+        values = np.random.default_rng(1).gamma(2.0, 0.03, 400)
+        (tmp_path / "rtt.csv").write_text("n,latency_s\n" + "".join(f"{k},{v}\n" for k, v in enumerate(values)))
+        model = latency({"kind": "recorded", "file": str(tmp_path / "rtt.csv"), "column": "latency_s"})
+        uniform = (np.arange(4000) + 0.5) / 4000
+        assert stats.ks_2samp(model.delays(uniform), values).statistic < 0.005
+        np.testing.assert_array_equal(model.delays(np.arange(400) / 399), np.sort(values))
+
+    def test_log_time_minus_stamp_of_a_topic(self) -> None:
+        """Of the sample log, whose messages were logged when they were stamped."""
+        file = str(Path(__file__).parents[2] / "logs" / "tc016d.mcap")
+        model = latency({"kind": "recorded", "file": file, "topic": "ground_truth", "stamp": "timestamp"})
+        assert set(model.delays(np.array([0.01, 0.5, 0.99])).tolist()) == {0.0}
+
+    @pytest.mark.parametrize(
+        ("text", "more", "said"),
+        [
+            ("latency_s\n-1\n-2\n0\n-3\n", {"column": "latency_s"}, "rtt.csv: column latency_s: 3 negative values"),
+            ("latency_s\n", {"column": "latency_s"}, "rtt.csv: column latency_s: expected seconds, found none"),
+            ("latency_s\nsoon\n", {"column": "latency_s"},
+             "rtt.csv: column latency_s: expected seconds, found what is no number"),
+            ("a,b\n1,2\n", {"column": "latency_s"},
+             "rtt.csv: column latency_s: there is no such column; there are a, b"),
+            ("a\n1\n", {}, "expected one of `column: <name>`"),
+        ],
+    )  # fmt: skip
+    def test_a_file_that_is_none_is_refused(self, tmp_path: Path, text: str, more: dict[str, str], said: str) -> None:
+        (tmp_path / "rtt.csv").write_text(text)
+        with pytest.raises(ValidationError, match=said):
+            latency({"kind": "recorded", "file": str(tmp_path / "rtt.csv"), **more})
+
+    def test_it_is_relative_to_the_experiment_and_stays_where_it_is(self, tmp_path: Path) -> None:
+        """A results folder names it relative to itself, and runs again."""
+        (tmp_path / "rtt.csv").write_text("latency_s\n0.1\n0.3\n")
+        log = Path(__file__).parents[2] / "logs" / "tc016d.mcap"
+        plain = (
+            (log.parent / "tc016d.yaml").read_text().replace("tc016d.mcap", str(log)).replace("runs: 500", "runs: 2")
+        )
+        text = re.sub(r"(?m)^configurations:.*\n(?:[ #].*\n|\n)*", CONFIGURATIONS, plain)
+        (tmp_path / "plan.yaml").write_text(text)
+        cr.run(tmp_path / "plan.yaml").write(tmp_path / "out")
+        cr.run(tmp_path / "out" / "experiment.yaml").write(tmp_path / "again")
+        tables = [(tmp_path / name / "summary.csv").read_bytes() for name in ("out", "again")]
+        assert tables[0] == tables[1]
+
+
+CONFIGURATIONS = """links: {v2x: {latency: {kind: recorded, file: rtt.csv, column: latency_s}}}
+configurations:
+  coop: {units: all, link: v2x}
+show: null
+"""
