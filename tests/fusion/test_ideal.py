@@ -292,7 +292,9 @@ def run_tracks(probability: float, log: Recording, without: int = -1) -> dict[st
     result = {}
     for combine in ("samples", "posterior"):
         seen = perceive(log.scene, found, plan, RUNS, states="sampled" if combine == "samples" else "expected")
-        fused_tracks = fuse(transmit(seen, [UnitLinks("link", ConstantLink())]), max_age_s=1.0, without_object_ix=without)
+        fused_tracks = fuse(
+            transmit(seen, [UnitLinks("link", ConstantLink())]), max_age_s=1.0, without_object_ix=without
+        )
         drawn = draw_posterior(fused_tracks, log.scene, plan.seed, RUNS) if combine == "posterior" else fused_tracks
         result[combine] = drawn.fused
     return result
