@@ -31,7 +31,7 @@ def info(
     readable, else 2.
     """
     if together:
-        return _clocks(logs)
+        return _clocks(logs, as_json=as_json)
     from copem_replay.experiment.draft.findings import as_json as plain
     from copem_replay.experiment.draft.survey import survey
     from copem_replay.experiment.draft.survey_text import describe
@@ -45,13 +45,18 @@ def info(
     return 0 if any(s.readable or any(u.problem is None for u in s.units) for s in surveys) else 2
 
 
-def _clocks(logs: Sequence[Path]) -> int:
+def _clocks(logs: Sequence[Path], *, as_json: bool) -> int:
     """Say how far the clocks of recordings are ahead of the first one's."""
     from copem_replay.experiment.draft.clocks import clocks
 
     if len(logs) < 2:
         raise InputError(f"--together: expected several recordings of one drive, found {len(logs)}")
-    for found in clocks(logs):
+    told = clocks(logs)
+    if as_json:
+        plain = [{"recording": str(one.path), "against": str(logs[0]), **one.plain()} for one in told]
+        print(json.dumps(plain, indent=1, ensure_ascii=False))
+        return 0
+    for found in told:
         say(f"{found.path}: clock_offset_s against {logs[0]}: {found.words()}; by {' and '.join(found.lists)}")
     return 0
 

@@ -18,6 +18,8 @@ WINDOW_S = 0.75
 """So far to both sides states are smoothed (chosen: errors of half a metre leave a velocity good to 0.3 m/s)."""
 SLOWEST_HZ = 0.5
 """Lists that come less often are not followed (chosen)."""
+GAP_LISTS, WINDOW_LISTS = 4.5, 4.0
+"""Of slow lists so many periods are a gap, and are smoothed over to each side: some miss an object (chosen)."""
 _EACH_SIDE = 2  # entries before and after an instant, at least: at the end of a track a velocity is a guess (chosen)
 _FASTEST_MPS = 60.0
 _SETTLED_S = 0.2  # so long it takes until an entry has changed where a track is taken to be (chosen)
@@ -75,6 +77,7 @@ class ShortTracks:
     y_m: Float
     velocity: Float  # (2, Q)
     gap_s: float
+    entries: Entries  # that they are of, in the same order, of which `track` numbers the tracks
 
     def at(self, times_s: Float) -> tuple[States, Int]:
         """States at instants (F,), ascending, of all tracks that are there, and which instant each is of."""
@@ -104,7 +107,7 @@ class ShortTracks:
     def nearest(
         self, other: Entries, offset_s: float, *, gate_m: float, faster_mps: float, mutual: bool = False
     ) -> tuple[Int, States, Float]:
-        """Which entries, shifted back by an offset, lie near what of these moves: rows, states there, and distances."""
+        """Which entries, shifted back by an offset, lie near what of these is faster: rows, states there, distances."""
         stamps_s, at = np.unique(other.time_s, return_inverse=True)
         states, instant = self.at(stamps_s - offset_s)
         moving = np.flatnonzero(np.hypot(*states.velocity) > faster_mps)
@@ -129,27 +132,37 @@ def _taken(states: States, rows: Int) -> States:
 
 def short_tracks(entries: Entries) -> ShortTracks:
     """The tracks of object lists."""
-    times_s = np.unique(entries.time_s)
-    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else np.inf
-    gap_s = max(0.5, 2.5 * step_s)
+    step_s = _step_s(entries)
+    return _smoothed(chained(entries), max(WINDOW_S, WINDOW_LISTS * step_s), max(0.5, GAP_LISTS * step_s))
+
+
+def chained(entries: Entries) -> Entries:
+    """Entries in order of tracks and time, `track` counting unbroken tracks; none where lists come too seldom."""
+    step_s = _step_s(entries)
+    gap_s = max(0.5, GAP_LISTS * step_s)
     if step_s > 1 / SLOWEST_HZ:
         entries = entries.take(np.empty(0, dtype=np.int64))
     elif len(entries.track) and entries.track.min() < 0:
         entries = replace(entries, track=followed(entries, gap_s))
-    order = np.lexsort((entries.time_s, entries.track))
-    entries = entries.take(order)
+    entries = entries.take(np.lexsort((entries.time_s, entries.track)))
     new = (np.diff(entries.track, prepend=-1) != 0) | (np.diff(entries.time_s, prepend=-np.inf) > gap_s)
     # A jump is another object under the same id.
     jump_m = np.hypot(np.diff(entries.x_m, prepend=np.nan), np.diff(entries.y_m, prepend=np.nan))
     new |= jump_m > _FASTEST_MPS * np.diff(entries.time_s, prepend=-np.inf) + 3.0
-    return _smoothed(entries, np.cumsum(new) - 1, max(WINDOW_S, 2.5 * step_s), gap_s)
+    return replace(entries, track=np.cumsum(new) - 1)
 
 
-def _smoothed(entries: Entries, track: Int, window_s: float, gap_s: float) -> ShortTracks:
+def _step_s(entries: Entries) -> float:
+    """The period of lists."""
+    times_s = np.unique(entries.time_s)
+    return float(np.median(np.diff(times_s))) if len(times_s) > 1 else np.inf
+
+
+def _smoothed(entries: Entries, window_s: float, gap_s: float) -> ShortTracks:
     """Parabolas through what is near in time, where there is enough on both sides."""
-    time_s = entries.time_s
+    time_s, track = entries.time_s, entries.track
     if not len(time_s):
-        return ShortTracks(time_s, track, entries.x_m, entries.y_m, np.empty((2, 0)), gap_s)
+        return ShortTracks(time_s, track, entries.x_m, entries.y_m, np.empty((2, 0)), gap_s, entries)
     axis = time_s + track * (float(np.ptp(time_s)) + 10 * window_s)
     low, high = np.searchsorted(axis, axis - window_s), np.searchsorted(axis, axis + window_s, side="right")
     here = np.arange(len(axis))
@@ -171,7 +184,7 @@ def _smoothed(entries: Entries, track: Int, window_s: float, gap_s: float) -> Sh
     normal = np.array([[sums[i + j] for j in range(3)] for i in range(3)]).transpose(2, 0, 1)
     solved = np.linalg.solve(normal, right.transpose(2, 1, 0)) if len(kept) else np.empty((0, 3, 2))
     x_m, y_m = entries.x_m[kept] + solved[:, 0, 0], entries.y_m[kept] + solved[:, 0, 1]
-    return ShortTracks(time_s[kept], track[kept], x_m, y_m, solved[:, 1].T, gap_s)
+    return ShortTracks(time_s[kept], track[kept], x_m, y_m, solved[:, 1].T, gap_s, entries)
 
 
 def followed(entries: Entries, gap_s: float) -> Int:

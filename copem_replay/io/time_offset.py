@@ -1,9 +1,9 @@
 """How far one object list's clock is ahead of another's, told by traffic that both list.
 
 An entry of the one at stamp t shows what the other has at t − offset. Entries are matched at the offsets of a grid; at
-the best, offset and what may be confused with it (a shift of the place, a bias along the way) are regressed on the
-residuals of matched entries of moving objects, with weights of Student's t. Errors are correlated from list to list, so
-that intervals come from leaving out blocks of time that are longer than that. Units are seconds and metres.
+the best, tracks of the other list are matched with tracks of the first, and offset and what may be confused with it (a
+shift of the place, a bias along the way) are those with which moving objects have one way through the entries of both.
+Intervals go by how far blocks of a track and a time, longer than errors last, disagree. Units are seconds and metres.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.io.short_tracks import Entries, ShortTracks, short_tracks
+from copem_replay.io.joint_ways import PIECE_S, JointWays, Pieces, pieces
+from copem_replay.io.short_tracks import Entries, ShortTracks, chained, short_tracks
 
 STEP_S = 0.05
 """Between the offsets that are tried (chosen: at 30 m/s no more than the width of the kernel)."""
@@ -39,9 +40,12 @@ RIVAL = 0.9
 _AT_MOST = 20_000  # entries of a list that are looked at (chosen)
 _FOLLOWED = 0.5  # of the entries, at least, are followed in the list that the other is held against (chosen)
 _SCORED = 2_000  # of them at every offset of the grid (chosen)
-_STUDENT = 4.0  # degrees of freedom of the weights
-_SHORTEST_S, _BLOCKS = 2.0, 6  # of a block; and so many there are at least, if they are not shorter (chosen)
-_FEWEST_BLOCKS = 4
+NEARLY = 0.7
+"""A track is one of the other list where so many of its entries in the time of that are nearest to it (chosen)."""
+_MATCHES = 3  # at least
+_SETTLED_S = 0.01  # tracks are not matched again where the offset has moved by less (chosen)
+_BLOCKS = 6  # there are at least, if they are no shorter than a piece (chosen)
+_FEWEST_BLOCKS = 3
 _FINEST_S = 0.001  # what smoothing and interpolation leave (chosen: the last digit that is said)
 _CERTAIN = 1.7  # so many half intervals biases move the offset: else they would cost precision for nothing (chosen)
 
@@ -61,18 +65,6 @@ class TimeOffset:
     drift: tuple[float, float, float] | None = None  # and its interval; None: the overlap is too short to tell
     untold: str | None = None
     unbiased: bool = False
-
-
-@dataclass(frozen=True)
-class _Pairs:
-    """Matched entries of moving objects, (K,) each: residuals along and across the way, and where and when."""
-
-    along_m: Float
-    across_m: Float
-    speed_mps: Float
-    heading: Float  # (2, K) unit vectors
-    time_s: Float
-    track: Int
 
 
 def time_offset(
@@ -114,49 +106,70 @@ def _offset(tracks: ShortTracks, other: Entries, within_s: tuple[float, float], 
         return TimeOffset(untold=f"it is not within {from_s:g} … {to_s:g} s")
     found = TimeOffset(untold=f"fewer than {FEWEST} entries of moving objects are in both")
     # What is slow, too, where it is needed: to tell a shift from an offset speeds have to vary.
+    chains = chained(other)
+    if not len(chains.time_s):
+        chains = replace(other, track=np.arange(len(other.time_s)))
     for faster_mps in (SLOW_MPS,) if shifted else (FAST_MPS, SLOW_MPS):
-        simple = _solved(tracks, other, float(grid[best]), faster_mps, biased=False)
+        simple = _solved(tracks, chains, float(grid[best]), faster_mps)
         if simple is None:
             continue
-        full = _solved(tracks, other, simple.offset_s, faster_mps, biased=True)
-        if full is None or full.half_width(0) > BIAS_S:
+        full = _Fit(simple.ways.pieces, simple.ways.offset_s, biased=True)
+        if full.half_width(0) > BIAS_S:
             found = _told(simple, unbiased=True)
         else:
-            biased = shifted or abs(full.offset_s - simple.offset_s) > _CERTAIN * full.half_width(0)
-            found = _told(full if biased else simple)
+            moved_s = abs(full.ways.offset_s - simple.ways.offset_s)
+            found = _told(full if shifted or moved_s > _CERTAIN * full.half_width(0) else simple)
         if found.untold is None:
             break
     return found
 
 
-def _solved(tracks: ShortTracks, other: Entries, offset_s: float, faster_mps: float, *, biased: bool) -> _Fit | None:
-    """The fit at the offset that it leads to; None: too little to go by."""
-    for _ in range(20):
-        pairs = _pairs(tracks, other, offset_s, faster_mps)
-        if len(pairs.along_m) < FEWEST:
+def _solved(tracks: ShortTracks, other: Entries, offset_s: float, faster_mps: float) -> _Fit | None:
+    """The fit at the offset that it leads to, with the tracks that match there; None: too little to go by."""
+    for _ in range(4):
+        rows, track = _same(tracks, other, offset_s)
+        found = pieces(tracks.entries, other.take(rows), track, offset_s, faster_mps)
+        if found is None or found.other.sum() < FEWEST:
             return None
-        fit = _Fit(pairs, offset_s, biased=biased)
-        if abs(fit.solved[0]) < 1e-5:
+        fit = _Fit(found, offset_s, biased=False)
+        moved_s, offset_s = abs(fit.ways.offset_s - offset_s), fit.ways.offset_s
+        if moved_s < _SETTLED_S:
             break
-        offset_s += float(np.clip(fit.solved[0], -0.1, 0.1))
     return fit
+
+
+def _same(tracks: ShortTracks, other: Entries, offset_s: float) -> tuple[Int, Int]:
+    """Entries of tracks of the other list that are nearest to one track nearly always, and that track."""
+    near, state, _ = tracks.nearest(other, offset_s, gate_m=GATE_M, faster_mps=-1.0, mutual=True)
+    pair, count = np.unique(np.stack([state.track, other.track[near]]), axis=1, return_counts=True)
+    edge = [np.searchsorted(tracks.track, pair[0], side=side) for side in ("left", "right")]
+    from_s, to_s = tracks.time_s[edge[0]] + offset_s, tracks.time_s[edge[1] - 1] + offset_s
+    begin, end = (np.searchsorted(other.track, pair[1], side=side) for side in ("left", "right"))
+    rows, of = [], []
+    for k in range(len(count)):
+        during = np.searchsorted(other.time_s[begin[k] : end[k]], [from_s[k], to_s[k]])
+        if count[k] >= max(NEARLY * (during[1] - during[0]), min(_MATCHES, end[k] - begin[k])):
+            rows.append(np.arange(begin[k], end[k]))
+            of.append(np.full(end[k] - begin[k], pair[0, k]))
+    none = np.empty(0, dtype=np.int64)
+    return np.concatenate([none, *rows]), np.concatenate([none, *of])
 
 
 def _told(fit: _Fit, *, unbiased: bool = False) -> TimeOffset:
     """The estimate with its interval, unless that is too wide."""
     if fit.blocks < _FEWEST_BLOCKS:
         return TimeOffset(untold="too short a time with moving objects in both")
-    half_s, pairs = float(np.hypot(fit.half_width(0), _FINEST_S)), fit.pairs
-    offset_s = fit.offset_s + float(fit.solved[0])
-    found = TimeOffset(offset_s, offset_s - half_s, offset_s + half_s, len(pairs.along_m), unbiased=unbiased)
+    found, offset_s = fit.ways.pieces, fit.ways.offset_s
+    half_s = float(np.hypot(fit.half_width(0), _FINEST_S))
+    told = TimeOffset(offset_s, offset_s - half_s, offset_s + half_s, int(found.other.sum()), unbiased=unbiased)
     if not half_s <= WIDEST_S:
         why = "nothing in both is fast enough, or varies enough in speed and direction"
-        return replace(found, untold=f"{offset_s:.3f} ± {half_s:.3f} s, which is too wide: {why}")
-    if np.ptp(pairs.time_s) < DRIFT_FROM_S:
-        return found
-    drifting = _Fit(pairs, fit.offset_s, biased=fit.biased, drift=True)
-    drift, half = float(drifting.solved[-1]), drifting.half_width(-1)
-    return replace(found, drift=(drift, drift - half, drift + half))
+        return replace(told, untold=f"{offset_s:.3f} ± {half_s:.3f} s, which is too wide: {why}")
+    if np.ptp(found.time_s) < DRIFT_FROM_S:
+        return told
+    drifting = _Fit(found, offset_s, biased=fit.ways.biased, drift=True)
+    drift, half = float(drifting.ways.solved[-1]), drifting.half_width(-1)
+    return replace(told, drift=(drift, drift - half, drift + half))
 
 
 def _score(tracks: ShortTracks, other: Entries, offset_s: float) -> float:
@@ -174,102 +187,56 @@ def _rival(score: Float, best: int) -> int | None:
     return None
 
 
-def _pairs(tracks: ShortTracks, other: Entries, offset_s: float, faster_mps: float) -> _Pairs:
-    """Entries that are nearest to each other, both ways, and what moves there."""
-    mine, state, _ = tracks.nearest(other, offset_s, gate_m=GATE_M, faster_mps=faster_mps, mutual=True)
-    velocity = state.velocity
-    speed_mps = np.hypot(*velocity)
-    heading = velocity / speed_mps
-    east, north = other.x_m[mine] - state.x_m, other.y_m[mine] - state.y_m
-    return _Pairs(
-        east * heading[0] + north * heading[1],
-        north * heading[0] - east * heading[1],
-        speed_mps,
-        heading,
-        other.time_s[mine],
-        state.track,
-    )
-
-
 class _Fit:
-    """Robust least squares of residuals on what is missing of an offset, on biases, and on a drift, in this order."""
+    """One way of each object through both lists, and how certain it is."""
 
-    def __init__(self, pairs: _Pairs, offset_s: float, *, biased: bool, drift: bool = False) -> None:
-        self.pairs, self.offset_s, self.biased = pairs, offset_s, biased
-        none, one = np.zeros_like(pairs.speed_mps), np.ones_like(pairs.speed_mps)
-        cos, sin = pairs.heading
-        along, across = [-pairs.speed_mps], [none]
-        if biased:  # a shift to the east, to the north, along the way
-            along, across = [*along, cos, sin, one], [*across, -sin, cos, none]
-        if drift:
-            along, across = [*along, -pairs.speed_mps * (pairs.time_s - pairs.time_s.mean())], [*across, none]
-        self._weigh(np.stack(along, axis=1), np.stack(across, axis=1))
-        self.block_of = self._blocks()
-        self.blocks = int(self.block_of.max()) + 1
-
-    def _weigh(self, along: Float, across: Float) -> None:
-        """Weights and scales that go with the solution, a few times over."""
-        pairs = self.pairs
-        self.solved = np.zeros(along.shape[1])
-        for _ in range(10):
-            left = np.stack([pairs.along_m - along @ self.solved, pairs.across_m - across @ self.solved])
-            scale_m = np.maximum(np.median(np.abs(left), axis=1) / 0.6745, 1e-3)
-            weight = (_STUDENT + 2) / (_STUDENT + ((left / scale_m[:, None]) ** 2).sum(axis=0))
-            self._each = _information(along, weight / scale_m[0] ** 2) + _information(across, weight / scale_m[1] ** 2)
-            self._right = (
-                along * (weight * pairs.along_m / scale_m[0] ** 2)[:, None]
-                + across * (weight * pairs.across_m / scale_m[1] ** 2)[:, None]
-            )
-            self.solved = np.linalg.lstsq(self._each.sum(axis=0), self._right.sum(axis=0), rcond=None)[0]
-        self._left_m = pairs.along_m - along @ self.solved
-        # Weights follow what they weigh: a block that is left out moves the solution more than with its weights kept.
-        far = ((left / scale_m[:, None]) ** 2).sum(axis=0)
-        bent = weight - 2 * (_STUDENT + 2) * (left[0] / scale_m[0]) ** 2 / (_STUDENT + far) ** 2
-        self._stretch = float(weight.sum() / max(bent.sum(), 0.3 * weight.sum()))
-
-    def _blocks(self) -> Int:
-        """(K,) the block of each pair: one track in a time that is longer than errors last."""
-        pairs = self.pairs
-        span_s = max(float(np.ptp(pairs.time_s)), 1e-9)
-        longest_s = max(span_s / _BLOCKS, _SHORTEST_S)
-        count = max(1, round(span_s / np.clip(5 * _memory_s(pairs, self._left_m), _SHORTEST_S, longest_s)))
-        into = np.minimum((pairs.time_s - pairs.time_s.min()) / span_s * count, count - 1)
-        return np.unique(np.stack([into.astype(np.int64), pairs.track]), axis=1, return_inverse=True)[1].ravel()
+    def __init__(self, found: Pieces, offset_s: float, *, biased: bool, drift: bool = False) -> None:
+        self.ways = JointWays(found, offset_s, biased=biased, drift=drift)
+        long_s = max(5 * _memory_s(found, self.ways.left_m), PIECE_S)
+        block_of = _blocks(found, long_s)
+        while block_of.max() + 1 < _BLOCKS and long_s > PIECE_S:
+            long_s = max(long_s / 2, PIECE_S)
+            block_of = _blocks(found, long_s)
+        self.blocks = int(block_of.max()) + 1
+        self._score = np.zeros((self.blocks, self.ways.score.shape[1]))
+        self._information = np.zeros((self.blocks, *self.ways.information.shape[1:]))
+        np.add.at(self._score, block_of, self.ways.score)
+        np.add.at(self._information, block_of, self.ways.information)
 
     def half_width(self, k: int, certain: float = 0.975) -> float:
-        """Half of the 95 % interval of a coefficient: blocks are left out one by one (jackknife)."""
+        """Half of the 95 % interval of a coefficient.
+
+        Blocks move it by so much, and would by errors of entries that know nothing of each other: where they do by
+        more, the interval is wider in proportion (Birge's ratio). It is never narrower than those errors make it.
+        """
         from scipy.stats import t
 
-        size = self.blocks
-        each = np.zeros((size, *self._each.shape[1:]))
-        right = np.zeros((size, self._right.shape[1]))
-        np.add.at(each, self.block_of, self._each)
-        np.add.at(right, self.block_of, self._right)
-        without = [
-            np.linalg.lstsq(each.sum(axis=0) - each[g], right.sum(axis=0) - right[g], rcond=None)[0][k]
-            for g in range(size)
-        ]
-        spread = np.sqrt((size - 1) / size * ((np.array(without) - self.solved[k]) ** 2).sum())
-        told = each[:, k, k]  # blocks that tell little are not as good as a block
-        freedom = max(float(told.sum() ** 2 / (told**2).sum()) - 1, 1.0)
-        return float(t.ppf(certain, freedom) * spread * self._stretch)
+        inverse = np.linalg.pinv(self._information.sum(axis=0))[k]
+        moved, variance = self._score @ inverse, np.einsum("c,gcd,d->g", inverse, self._information, inverse)
+        freedom = max(self.blocks - len(inverse), 1)
+        ratio = (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
+        return float(t.ppf(certain, freedom) * np.sqrt(max(ratio, 1.0) * variance.sum()) * self.ways.stretch)
 
 
-def _information(columns: Float, weight: Float) -> Float:
-    """(K, C, C) of each pair."""
-    return weight[:, None, None] * columns[:, :, None] * columns[:, None, :]
+def _blocks(found: Pieces, long_s: float) -> Int:
+    """(P,) the block of each piece: of one track, and so long."""
+    into = ((found.middle_s - found.middle_s.min()) / long_s).astype(np.int64)
+    blocks: Int = np.unique(np.stack([found.track, into]), axis=1, return_inverse=True)[1].ravel()
+    return blocks
 
 
-def _memory_s(pairs: _Pairs, left_m: Float) -> float:
+def _memory_s(found: Pieces, left_m: Float) -> float:
     """How long errors last: from the correlation of residuals about half a second apart, of one track."""
-    order = np.lexsort((pairs.time_s, pairs.track))
-    time_s, track, left_m = pairs.time_s[order], pairs.track[order], np.clip(left_m[order], -GATE_M, GATE_M)
+    mine = np.flatnonzero(found.other)
+    time_s, track = found.time_s[mine], found.track[found.of[mine]]
+    order = np.lexsort((time_s, track))
+    time_s, track, left_m = time_s[order], track[order], np.clip(left_m[mine[order]], -GATE_M, GATE_M)
     axis = time_s + track * (np.ptp(time_s) + 10)
     later = np.searchsorted(axis, axis + 0.5)
-    found = np.flatnonzero(later < len(axis))
-    found = found[axis[later[found]] - axis[found] < 0.8]
-    if len(found) < FEWEST:
+    pair = np.flatnonzero(later < len(axis))
+    pair = pair[axis[later[pair]] - axis[pair] < 0.8]
+    if len(pair) < FEWEST:
         return 0.0
-    lag_s = float(np.mean(axis[later[found]] - axis[found]))
-    correlation = float(np.mean(left_m[found] * left_m[later[found]]) / np.mean(left_m**2))
+    lag_s = float(np.mean(axis[later[pair]] - axis[pair]))
+    correlation = float(np.mean(left_m[pair] * left_m[later[pair]]) / np.mean(left_m**2))
     return 0.0 if correlation < 0.05 else lag_s / -np.log(min(correlation, 0.95))

@@ -52,6 +52,21 @@ class ClockFound:
             said += f", the delay of {' and '.join(self.late)} included, which {do} not say when captured"
         return said
 
+    def plain(self) -> dict[str, object]:
+        """The same for JSON: seconds, and seconds per second; null where it cannot be told, and `untold` says why."""
+        found = self.offset
+        told = found.untold is None
+        return {
+            "lists": list(self.lists),
+            "clock_offset_s": found.offset_s if told else None,
+            "interval_s": [found.low_s, found.high_s] if told else None,
+            "drift": found.drift[0] if told and found.drift else None,
+            "drift_interval": list(found.drift[1:]) if told and found.drift else None,
+            "entries": found.entries,
+            "if_not_shifted": found.unbiased,
+            "untold": found.untold,
+        }
+
 
 @dataclass(frozen=True)
 class _Lists:
