@@ -22,6 +22,7 @@ class Channel:
     schema_encoding: str = ""
     schema_data: bytes = field(default=b"", repr=False)
     ahead_ns: int = 0  # how far stamps in its messages are ahead of the times they were logged at, by another clock
+    part: str = ""  # which of several recordings of one drive it is of
 
 
 def schema_name(channel: Channel) -> str:

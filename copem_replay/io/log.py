@@ -28,7 +28,7 @@ from copem_replay.io.containers.mcap_indexed import in_order, summary_of
 from copem_replay.io.containers.mcap_records import DAMAGE, without_trace
 from copem_replay.io.containers.mcap_recovery import FromStart
 from copem_replay.io.containers.unsupported import check_magic
-from copem_replay.io.together import AHEAD
+from copem_replay.io.together import AHEAD, PART
 from copem_replay.io.window import ALWAYS, Span, Window, kept
 
 _READ_AT_ONCE = 1 << 16
@@ -244,4 +244,5 @@ def _channel(number: int, channel: Any, schema: Any, messages: int, expected: in
         schema_encoding=schema.encoding if schema is not None else "",
         schema_data=schema.data if schema is not None else b"",
         ahead_ns=_ahead_ns(channel.metadata.get(AHEAD, "")),
+        part=channel.metadata.get(PART, ""),
     )

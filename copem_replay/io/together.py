@@ -9,6 +9,9 @@ from typing import Final, TypeAlias
 AHEAD: Final = "copem_replay:clock_ahead_ns"
 """Metadata of a channel whose stamps are by a clock that is ahead of that of the log times, and by how much."""
 
+PART: Final = "copem_replay:recording"
+"""Metadata of a channel that was written from several recordings: which of them it is of."""
+
 
 @dataclass(frozen=True)
 class Together:

@@ -7,8 +7,9 @@ from odometry (`io/ego_pose.py`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,11 @@ class LogContext:
     ego: PoseTrack | None
     asked: EgoTopic | None
     notes: tuple[str, ...]
+    own: Mapping[tuple[str, str], str] = field(default_factory=dict)  # `_own_names`
+
+    def named(self, found: DecodedLists) -> list[str]:
+        """The frames of lists as they are known here."""
+        return [self.own.get((found.part, name.lstrip("/")), name.lstrip("/")) for name in found.frames]
 
     def world_for(self, frame: str) -> str:
         """The frame that all is brought into, where lists are in `frame`."""
@@ -50,7 +56,7 @@ class LogContext:
     def world_of(self, found: DecodedLists) -> str:
         """The frame that lists are brought into, "" where no list names one."""
         said = found.frame_code[found.frame_code >= 0]
-        return self.world_for(found.frames[said[0]].lstrip("/") if len(said) else "")
+        return self.world_for(self.named(found)[said[0]] if len(said) else "")
 
 
 def log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> LogContext:
@@ -75,16 +81,23 @@ def log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> LogConte
             notes.append(f"topic {channel.topic} ({channel.schema}) not read: {error}")
             continue
         of_channel[channel.number] = poses
-        frames.add(poses, static=channel.topic.endswith("tf_static"))
+    part_of = {channel.number: channel.part for channel in channels}
+    own = _own_names({(part_of[number], child) for number, poses in of_channel.items() for child in poses.child})
+    for channel in channels:
+        if channel.number in of_channel:
+            of_channel[channel.number] = _renamed(of_channel[channel.number], channel.part, own)
+            frames.add(of_channel[channel.number], static=channel.topic.endswith("tf_static"))
     chosen = ego_channel(log, channels, asked, seek_ego)
     if chosen is None:
-        return LogContext(frames, None, asked, tuple(notes))
+        return LogContext(frames, None, asked, tuple(notes), own)
     if not found.payloads[chosen.number]:
         raise EgoError(f"no pose on topic {chosen.topic!r}{in_the_window(log)}", path=log.path)
     if chosen.number not in of_channel:  # which is among the notes
-        return LogContext(frames, None, asked, tuple(notes))
+        return LogContext(frames, None, asked, tuple(notes), own)
+    if asked is not None and asked.frame is not None:
+        asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
     course = ego_course(log, chosen.topic, of_channel[chosen.number], asked)
-    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)))
+    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own)
 
 
 def _bare(poses: Poses) -> Poses:
@@ -92,6 +105,20 @@ def _bare(poses: Poses) -> Poses:
     return replace(
         poses, frame=tuple(n.lstrip("/") for n in poses.frame), child=tuple(n.lstrip("/") for n in poses.child)
     )
+
+
+def _own_names(children: Set[tuple[str, str]]) -> dict[tuple[str, str], str]:
+    """Frames that several recordings of one drive place, each in its own way, by recording and name: named after it.
+
+    A frame that none places, or one alone, is the same for all: they share the world.
+    """
+    times = Counter(child for _, child in children if child)
+    return {(part, child): f"{part}:{child}" for part, child in children if times[child] > 1}
+
+
+def _renamed(poses: Poses, part: str, own: Mapping[tuple[str, str], str]) -> Poses:
+    frame, child = (tuple(own.get((part, name), name) for name in names) for names in (poses.frame, poses.child))
+    return replace(poses, frame=frame, child=child)
 
 
 def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> DecodedLists:
@@ -108,7 +135,9 @@ def lists_of(log: Log, channels: Sequence[Channel], fields: Fields | None) -> De
         raise RecordingError(str(error), path=log.path, topic=channel.topic) from None
     columns = lists.columns
     stamp_ns = columns.stamp_ns - np.where(columns.stamped, channel.ahead_ns, 0)
-    return replace(lists, columns=replace(columns, stamp_ns=stamp_ns, notes=(*columns.notes, *found.notes())))
+    return replace(
+        lists, part=channel.part, columns=replace(columns, stamp_ns=stamp_ns, notes=(*columns.notes, *found.notes()))
+    )
 
 
 def in_world(found: DecodedLists, around: LogContext, path: Path, topic: str) -> DecodedLists:
@@ -116,7 +145,7 @@ def in_world(found: DecodedLists, around: LogContext, path: Path, topic: str) ->
 
     Raises RecordingError, naming `path` and `topic`, where the recording does not say how frames lie to each other.
     """
-    names = [name.lstrip("/") for name in found.frames]
+    names = around.named(found)
     if not len(found.frame_code) or not names:
         return found
     world = around.world_of(found)

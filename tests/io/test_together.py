@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +14,23 @@ from typer.testing import CliRunner
 
 import copem_replay as cr
 from copem_replay.cli.main import app
-from copem_replay.experiment.draft.clocks import clocks
+from copem_replay.experiment.draft.clocks import ClockFound, clocks
 from copem_replay.io.containers.joined import labels_of
+from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
 from copem_replay.io.recorded_osi import read_recorded
 from copem_replay.io.recording import read
+from copem_replay.io.schemas.decoded import X, Y
+from copem_replay.io.time_offset import TimeOffset
 from copem_replay.io.together import Together
 from copem_replay.io.window import Window
+from copem_replay.io.world_frame import in_world, lists_of, log_context
 from tests.experiment.test_validate import against_logs, without_logs
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, Topic, ns, truth_topic, write_mcap
+from tests.helpers.ros2 import made, topic, transform
 from tests.io.test_recorded_units import car, list_of
+from tests.io.test_world_frame import json_topic
 
 AHEAD_S = 0.375
 FRAMES = [(10 + 0.1 * k, [Obj(id=1), Obj(id=2, x=70.0 - k, vx=-10.0)]) for k in range(40)]
@@ -175,6 +183,11 @@ class TestClocks:
         told = CliRunner().invoke(app, ["info", *logs, "--together"], standalone_mode=False)
         assert told.return_value == 0
         assert f"clock_offset_s against {logs[0]}: {found.words()}" in told.output.replace("\n", " ")
+        (plain,) = json.loads(CliRunner().invoke(app, ["info", *logs, "--together", "--json"]).output)
+        assert (plain["recording"], plain["against"], plain["lists"]) == (logs[1], logs[0], list(found.lists))
+        assert plain["clock_offset_s"] == found.offset.offset_s
+        assert plain["interval_s"] == [found.offset.low_s, found.offset.high_s]
+        assert (plain["drift"], plain["entries"], plain["untold"]) == (None, found.offset.entries, None)
         drafted = CliRunner().invoke(app, ["init", *logs, "--together"], standalone_mode=False).output
         assert f"{round(found.offset.offset_s, 3)}   # {found.words()}" in drafted
         (tmp_path / "experiment.yaml").write_text(drafted)
@@ -202,6 +215,13 @@ class TestClocks:
         write_mcap(folder / "rsu.mcap", [Topic("objects", "osi3.SensorData", rsu(0.0).messages[:3])])
         (found,) = clocks([folder / "ego.mcap", folder / "rsu.mcap"])
         assert found.words().startswith("cannot be told: ")
+        assert found.words().endswith(found.plain()["untold"])
+        assert found.plain()["clock_offset_s"] is found.plain()["interval_s"] is None
+
+    def test_the_drift_is_in_the_json_with_its_interval(self) -> None:
+        offset = TimeOffset(0.1, 0.05, 0.15, 40, (1e-4, 5e-5, 2e-4))
+        plain = ClockFound(Path("b.mcap"), ("a:x", "b:y"), offset).plain()
+        assert (plain["drift"], plain["drift_interval"]) == (1e-4, [5e-5, 2e-4])
 
 
 class TestRefused:
@@ -259,3 +279,62 @@ class TestRefused:
         assert line.endswith("choose one with `read: {topic: …}` in the experiment")
         chosen = entry.replace("}", ", read: {topic: 'rsu:truth'}, ego: 1}")
         assert against_logs(folder, changed(f"logs: [{chosen}]")) == []
+
+
+class TestFrames:
+    """Two ROS 2 bags whose transforms have the same names: a car that drives, and a mast that looks back."""
+
+    @staticmethod
+    def bags(folder: Path) -> tuple[Path, Path]:
+        def bag(name: str, place: Callable[[float], tuple[float, float, float]]) -> Path:
+            kind = "tf2_msgs/msg/TFMessage"
+            times = [0.1 * k for k in range(11)]
+            moving = [(t, made(kind, transforms=[transform(t, "map", "base_link", *place(t))])) for t in times]
+            lidar = made(kind, transforms=[transform(0.0, "base_link", "lidar", 2.0, 0.0)])
+            boxes = [(t, cubes(t)) for t in times]
+            return write_mcap(
+                folder / f"{name}.mcap",
+                [
+                    topic("/tf", kind, moving),
+                    topic("/tf_static", kind, [(0.0, lidar)]),
+                    json_topic("/scene", boxes, schema="foxglove.SceneUpdate"),
+                ],
+            )
+
+        return bag("ego", lambda t: (10 * t, 0.0, 0.0)), bag("mast", lambda t: (50.0, 20.0, 180.0))
+
+    def test_each_list_goes_by_the_transforms_of_its_own_bag(self, tmp_path: Path) -> None:
+        log = open_log(Together(self.bags(tmp_path), (0.0, 0.0)))
+        assert self.places(log) == {"ego:/scene": (10 * 0.5 + 2 + 5, 0.0), "mast:/scene": (50.0 - 2 - 5, 20.0)}
+
+    def test_a_frame_that_one_bag_alone_places_is_known_to_both(self, tmp_path: Path) -> None:
+        """The mount of a lidar in the bag of the lidar, where the car is in the other."""
+        ego, mast = self.bags(tmp_path)
+        kind = "tf2_msgs/msg/TFMessage"
+        mount = made(kind, transforms=[transform(0.0, "base_link", "lidar", 3.0, 0.0)])
+        boxes = json_topic("/scene", [(0.1 * k, cubes(0.1 * k)) for k in range(11)], schema="foxglove.SceneUpdate")
+        write_mcap(mast, [topic("/tf_static", kind, [(0.0, mount)]), boxes])
+        places = self.places(open_log(Together((ego, mast), (0.0, 0.0))))
+        assert places == {"ego:/scene": (10 * 0.5 + 2 + 5, 0.0), "mast:/scene": (10 * 0.5 + 3 + 5, 0.0)}
+
+    @staticmethod
+    def places(log: Log) -> dict[str, tuple[float, float]]:
+        """Where the box of each list is after half a second."""
+        around = log_context(log, None, seek_ego=False)
+        found = {}
+        for channel in log.channels:
+            if channel.schema == "foxglove.SceneUpdate":
+                lists = in_world(lists_of(log, [channel], None), around, log.path, channel.topic)
+                at = lists.columns.values[5]
+                found[channel.topic] = (round(float(at[X]), 6), round(float(at[Y]), 6))
+        return found
+
+
+def cubes(t_s: float) -> dict[str, Any]:
+    """A car 5 m ahead of a lidar."""
+    at = {"sec": ns(t_s) // 10**9, "nsec": ns(t_s) % 10**9}
+    placed = {"position": {"x": 5, "y": 0, "z": 1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    cube = {"pose": placed, "size": {"x": 4, "y": 2, "z": 1.5}}
+    metadata = [{"key": "category", "value": "vehicle.car"}]
+    entity = {"id": "c1", "timestamp": at, "frame_id": "lidar", "cubes": [cube], "metadata": metadata}
+    return {"deletions": [], "entities": [entity]}

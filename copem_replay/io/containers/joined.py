@@ -90,7 +90,8 @@ def joined(place: Together, logs: Sequence[Log]) -> Joined:
         for c in log.channels:
             numbers[c.number] = len(channels) + 1
             topic = named(c.topic, label) if files[c.topic] > 1 else c.topic
-            channels.append(replace(c, number=len(channels) + 1, topic=topic, ahead_ns=c.ahead_ns + ahead_ns))
+            moved = replace(c, number=len(channels) + 1, topic=topic, ahead_ns=c.ahead_ns + ahead_ns)
+            channels.append(replace(moved, part=part_of(label, c.part)))
         parts.append(JoinedPart(log, numbers, ahead_ns, label))
     damages = [f"{log.path.name}: {log.damage}" for log in logs if log.damage]
     return Joined(
@@ -111,6 +112,11 @@ def joined(place: Together, logs: Sequence[Log]) -> Joined:
 def named(topic: str, label: str) -> str:
     """A topic that several files have, after its file."""
     return f"{label}:{topic}"
+
+
+def part_of(label: str, before: str) -> str:
+    """The recording that a channel is of, in a file that may itself have been written from several."""
+    return f"{label}/{before}" if before else label
 
 
 def labels_of(paths: Sequence[Path]) -> list[str]:

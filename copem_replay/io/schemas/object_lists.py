@@ -52,6 +52,7 @@ class DecodedLists:
     probability: Float
     log_time_ns: Int  # (F,)
     named: bool  # whether its objects have ids
+    part: str = ""  # which of several recordings of one drive they are of
 
 
 def listed(

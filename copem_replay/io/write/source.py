@@ -15,13 +15,13 @@ from typing import Protocol, cast
 from mcap.records import Channel, Message
 
 from copem_replay.io.containers.in_order import merged
-from copem_replay.io.containers.joined import Joined, JoinedPart, moved_back, named
+from copem_replay.io.containers.joined import Joined, JoinedPart, moved_back, named, part_of
 from copem_replay.io.containers.mcap_indexed import renumbered
 from copem_replay.io.containers.osi_trace import Trace, message_class
 from copem_replay.io.containers.rosbag2 import Bag
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
-from copem_replay.io.together import AHEAD, Place
+from copem_replay.io.together import AHEAD, PART, Place
 from copem_replay.io.window import Window
 from copem_replay.io.write.message_family import OSI_CHANNEL, osi_version
 from copem_replay.io.write.pass_through import Catalogue, Original
@@ -108,6 +108,7 @@ class _Named:
     def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
         ahead_ns = self._part.ahead_ns + int(metadata.get(AHEAD, "0"))
         said = metadata | ({AHEAD: str(ahead_ns)} if ahead_ns else {})
+        said |= {PART: part_of(self._part.label, metadata.get(PART, ""))}
         topic = named(topic, self._part.label) if topic in self._several else topic
         return self._catalogue.channel(topic, encoding, schema, said)
 
