@@ -192,12 +192,16 @@ class _Fit:
 
     def __init__(self, found: Pieces, offset_s: float, *, biased: bool, drift: bool = False) -> None:
         self.ways = JointWays(found, offset_s, biased=biased, drift=drift)
-        long_s = max(5 * _memory_s(found, self.ways.left_m), PIECE_S)
+        memory_s = _memory_s(found, self.ways.left_m)
+        long_s = max(5 * memory_s, PIECE_S)
         block_of = _blocks(found, long_s)
         while block_of.max() + 1 < _BLOCKS and long_s > PIECE_S:
             long_s = max(long_s / 2, PIECE_S)
             block_of = _blocks(found, long_s)
         self.blocks = int(block_of.max()) + 1
+        # Errors go on into the next block: a mean over many blocks varies so much more than if they did not. Exact for
+        # exponential memory (2 τ T against 2 τ (L - τ) T / L); too short a block counts as five τ.
+        self._beyond = long_s / max(long_s - memory_s, 0.8 * long_s)
         self._score = np.zeros((self.blocks, self.ways.score.shape[1]))
         self._information = np.zeros((self.blocks, *self.ways.information.shape[1:]))
         np.add.at(self._score, block_of, self.ways.score)
@@ -214,7 +218,7 @@ class _Fit:
         inverse = np.linalg.pinv(self._information.sum(axis=0))[k]
         moved, variance = self._score @ inverse, np.einsum("c,gcd,d->g", inverse, self._information, inverse)
         freedom = max(self.blocks - len(inverse), 1)
-        ratio = (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
+        ratio = self._beyond * (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
         return float(t.ppf(certain, freedom) * np.sqrt(max(ratio, 1.0) * variance.sum()) * self.ways.stretch)
 
 

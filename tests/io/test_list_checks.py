@@ -111,8 +111,8 @@ def test_a_draft_has_the_delay_with_its_interval(path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("trial", "near_s", "confounded"),
-    [("3", 0.148, True), ("4", 0.134, True), ("5", 0.124, True), ("14", 0.208, False), ("15", 0.175, False),
-     ("11_ped", 0.467, True)],
+    [("3", 0.147, True), ("4", 0.137, True), ("5", 0.119, True), ("14", 0.219, False), ("15", 0.172, False),
+     ("11_ped", 0.469, True)],
 )  # fmt: skip
 def test_of_a_roadside_unit(trial: str, near_s: float, confounded: bool) -> None:
     """What was found, not what is known: design notes have 0.15 and 0.14 s of smallest RMSE for trials 3 and 5."""
@@ -124,5 +124,5 @@ def test_of_a_roadside_unit(trial: str, near_s: float, confounded: bool) -> None
     assert delay.untold is None
     assert delay.offset_s == pytest.approx(near_s, abs=0.003)
     assert delay.unbiased == confounded
-    assert delay.low_s < delay.offset_s < delay.high_s < delay.low_s + 0.17
+    assert delay.low_s < delay.offset_s < delay.high_s < delay.low_s + 0.2
     assert any("point against the way" in line for line in odd(recording, found, delay.offset_s))
