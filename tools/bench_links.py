@@ -1,4 +1,4 @@
-"""What it costs that lists arrive at other times in every run.
+"""What drawn arrivals cost: a minute of 20 objects, five units at 10 Hz, by a link that is sure and by one that is not.
 
 Medians of nine runs of all, in turn, in seconds of the processor, of which the constant latency's are taken away.
 """

@@ -148,7 +148,8 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
         yield source.at(("sweep", "correlation_s"), "no PEM has `memory: {detection: […]}`")
     for kind in ("loss", "burst_s"):
         if sweep.get(kind):
-            yield from _swept_links(source, kind, sweep[kind])
+            chosen = named.get(kind) if isinstance(named, dict) else named
+            yield from _swept_links(source, kind, sweep[kind], chosen if isinstance(chosen, list) else configurations)
     others = sum(1 for _, unit in _items(data.get("units")) if unit.get("on") != "ego")
     counts = sweep.get("units")
     for k, count in enumerate(counts if isinstance(counts, list) else []):
@@ -158,10 +159,16 @@ def _sweep(source: Source, data: dict[str, Any], units: Sequence[str]) -> Iterat
             )
 
 
-def _swept_links(source: Source, kind: str, values: object) -> Iterator[str]:
-    """Links whose loss is no one number to vary, or that cannot have it; that there are none."""
-    found = False
+def _swept_links(source: Source, kind: str, values: object, chosen: Sequence[object]) -> Iterator[str]:
+    """Links of the configurations chosen whose loss is no one number to vary, or cannot be it; that there are none."""
+    found, used = False, set()
+    for name, configuration in _items(source.data.get("configurations")):
+        if name in map(str, chosen):
+            link = configuration.get("link")
+            used |= set(map(str, link.values())) if isinstance(link, dict) and "kind" not in link else {str(link)}
     for name, link in _items(source.data.get("links")):
+        if name not in used:
+            continue
         reception, memory = link.get("reception"), link.get("memory")
         of = reception.get("kind") if isinstance(reception, dict) else "constant"
         if kind == "loss" and of not in ("constant", "gilbert_elliott"):

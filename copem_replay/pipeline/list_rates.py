@@ -60,7 +60,8 @@ def _add(result: dict[str, list[ListTimes]], world: WorldChunk, run: Int) -> Non
         issue_s: Float = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s
         issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= end_s + _TOLERANCE_S)]
         covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
-        linked = [unit for unit in heard.units if configuration.link_of(unit) is not None]
+        sending = world.experiment.units_of(configuration) or (TRUTH,)
+        linked = [unit for unit in sending if configuration.link_of(unit) is not None]
         links = None
         if linked:
             sent = world.truth if configuration.units == TRUTH else seen

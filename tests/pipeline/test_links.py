@@ -255,10 +255,12 @@ def test_lists_of_wired_units_are_none_of_the_links() -> None:
         "latency": {"kind": "gamma", "mean_s": 0.2, "shape": 1},
         "reception": {"kind": "constant", "probability": 0.5},
     }
-    wired = {"coop": {"units": "all", "link": {"default": "slow", "ego": "none"}}}
-    some = plan(None, links={"slow": slow}, configurations=wired, runs=30)
+    wired = {"coop": {"units": ["ego", "east", "west"], "link": {"default": "slow", "ego": "none"}}}
+    unheard = {"far": {"at": [90.0, 8], "height_m": 5, "pem": "half"}}
+    units = plan(None).as_written()["units"] | unheard
+    some = plan(None, links={"slow": slow}, configurations=wired, runs=30, units=units)
     heard = [heard_by(some, one=k) for k in range(30)]
-    sent = [one.common_arrives_s[one.frame_unit_ix > 0] for one in heard]
+    sent = [one.common_arrives_s[np.isin(one.frame_unit_ix, (1, 2))] for one in heard]
     [row] = run(some, [traffic()]).summary.to_dict("records")
     assert row["lost_share"] == np.mean([np.isinf(one).mean() for one in sent])
     assert row["lost_share"] == pytest.approx(0.5, abs=0.04)
