@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from copem_replay.cli.api.results import compare, load_results, view, write_report
     from copem_replay.cli.api.run import StudyResult, fused_tracks, observations, run
     from copem_replay.cli.api.study import load_experiment
+    from copem_replay.communication.latency import LatencyModel
     from copem_replay.communication.link import LinkModel, SentLists
+    from copem_replay.communication.reception import RadioPath, ReceptionModel
+    from copem_replay.communication.testing import LINK_RULES, BrokenLinkRuleError, check_latency, check_reception
     from copem_replay.core.errors import (
         CopemError,
         EmptyWindowError,
@@ -61,6 +64,8 @@ if TYPE_CHECKING:
 __all__ = [
     "CLASSES",
     "FUSION_RULES",
+    "LINK_RULES",
+    "BrokenLinkRuleError",
     "Comparison",
     "Configuration",
     "CopemError",
@@ -75,6 +80,7 @@ __all__ = [
     "Inbox",
     "InputError",
     "Inputs",
+    "LatencyModel",
     "LinkModel",
     "ListFusion",
     "Measure",
@@ -82,7 +88,9 @@ __all__ = [
     "ObjectLists",
     "Onset",
     "OutputError",
+    "RadioPath",
     "Reaction",
+    "ReceptionModel",
     "Recording",
     "RecordingError",
     "Results",
@@ -96,6 +104,8 @@ __all__ = [
     "ViewGeometry",
     "VisibilityModel",
     "check_fusion",
+    "check_latency",
+    "check_reception",
     "compare",
     "cumulative_incidence",
     "draft_experiment",
@@ -122,7 +132,10 @@ _PLACES = {
     "cli.api.results": "compare load_results view write_report",
     "cli.api.run": "StudyResult fused_tracks observations run",
     "cli.api.study": "load_experiment",
+    "communication.latency": "LatencyModel",
     "communication.link": "LinkModel SentLists",
+    "communication.reception": "RadioPath ReceptionModel",
+    "communication.testing": "LINK_RULES BrokenLinkRuleError check_latency check_reception",
     "core.errors": "CopemError EmptyWindowError ExperimentError InputError OutputError RecordingError",
     "core.fused_tracks": "FusedTracks",
     "core.object_list": "Inputs ObjectLists entries_of",

@@ -1,4 +1,4 @@
-"""How much later objects are known by radio, at which loss, bursts and distance; printed for docs/links.md.
+"""How much later objects are known by radio, at which loss, bursts and distance; printed for docs/guide/links.md.
 
 copem-replay run logs/crossing_radio.yaml --out out/crossing_radio
 python tools/links_table.py out/crossing_radio

@@ -47,6 +47,7 @@ def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
     [
         ("README.md", [], ["copem-replay run"]),
         ("docs/tutorial.md", ["copem-replay run"], ["python tools/paper.py"]),
+        ("docs/guide/links.md", ["copem-replay run"], ["python tools/links_table.py"]),
         ("docs/guide/which-fusion.md", ["copem-replay run"] * 2, ["copem-replay compare"] * 2),
     ],
 )
@@ -82,9 +83,14 @@ def test_pages_show_what_their_commands_print(
         assert printed(command) == expected
 
 
+def test_the_own_reception_of_the_links_page_keeps_the_rules() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/guide/links.md").read_text(encoding="utf-8"), re.DOTALL)
+    exec(code, {"__name__": "page"})
+
+
 def test_all_outputs_on_pages_are_tested() -> None:
     marked = [page for page in PAGES if "<!-- output: " in page.read_text(encoding="utf-8")]
-    assert sorted(page.name for page in marked) == ["README.md", "tutorial.md", "which-fusion.md"]
+    assert sorted(page.name for page in marked) == ["README.md", "links.md", "tutorial.md", "which-fusion.md"]
 
 
 @pytest.mark.long
