@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from copem_replay.core.lasting import ListTimes, always, drifting, held, shared
 from copem_replay.core.memory import Part, numbered
@@ -86,6 +85,8 @@ class Draws:
         if not drifts:
             found = held(self.rng, purpose, random_key, self.runs, tau_s, where=where)
             if normal:
+                from scipy.special import ndtri  # it takes long to import, as below
+
                 found = ndtri(np.clip(found, _LOWEST, 1 - _LOWEST))
             return found
         lists = None if part.of in ("object", "all") else self.lists
@@ -99,7 +100,12 @@ class Draws:
             found = found[:, np.searchsorted(there, self.lists.frame_ix)]
         else:
             found = drifting(self.rng, purpose, random_key, self.runs, tau_s, lists=lists, where=where)
-        return found if normal else np.clip(ndtr(found), _LOWEST, 1 - _LOWEST)
+        if normal:
+            return found
+        from scipy.special import ndtr
+
+        uniform: Float = np.clip(ndtr(found), _LOWEST, 1 - _LOWEST)
+        return uniform
 
     def _once(self, purpose: str, random_key: RandomKey, normal: bool) -> Float:
         """(S, P) one number for each series, drawn once where its rows follow each other."""

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from copem_replay.core.tracks import Float, Int, Tracks
 
@@ -117,6 +116,8 @@ class ShortTracks:
         if not len(moving):
             none = np.empty(0, dtype=np.int64)
             return none, _taken(states, none), np.empty(0)
+        from scipy.spatial import cKDTree  # it takes long to import
+
         away_m, k = cKDTree(theirs).query(mine, distance_upper_bound=gate_m)
         rows = np.flatnonzero(np.isfinite(away_m))
         if mutual and len(rows):

@@ -10,7 +10,6 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
-from scipy.special import ndtri
 
 from copem_replay.core.components import Component, Frozen, NotNegative, Number, Positive, Slot
 from copem_replay.core.tracks import Float
@@ -61,6 +60,8 @@ class AtPlaces(GhostPlace):
     def places_m(self, uniform: Float, length_m: Float, width_m: Float) -> Float:
         """A place alike for all, and a standard deviation of `spread_m` in easting and in northing."""
         which = np.minimum((uniform[2] * len(self.at_m)).astype(np.int64), len(self.at_m) - 1)
+        from scipy.special import ndtri  # it takes long to import
+
         places: Float = np.array(self.at_m)[which].T + self.spread_m * ndtri(uniform[:2])
         return places
 
