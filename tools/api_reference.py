@@ -36,8 +36,9 @@ GROUPS = {
     "Figures": "plot",
     "Keys of an experiment": "Experiment Unit Configuration Measure Onset",
     "Data": "Recording Scene Tracks ObjectLists Inputs Inbox entries_of ViewGeometry Errors CLASSES",
-    "Own components": "DetectionModel ErrorModel VisibilityModel LinkModel SentLists StepFusion ListFusion Driver "
-    "Reaction RowMetric check_fusion NonconformingError FUSION_RULES",
+    "Own components": "DetectionModel ErrorModel VisibilityModel LatencyModel ReceptionModel RadioPath LinkModel "
+    "SentLists StepFusion ListFusion Driver Reaction RowMetric check_fusion NonconformingError FUSION_RULES "
+    "check_latency check_reception BrokenLinkRuleError LINK_RULES",
     "Metrics": "gospa ospa cumulative_incidence",
     "Errors": "CopemError InputError ExperimentError RecordingError EmptyWindowError OutputError",
 }

@@ -26,6 +26,9 @@ class RadioPath:
 
     `visible_share`: how much of the ego shows from the unit: what blocks sight blocks radio. A unit on the ego has
     distance 0 and share 1; where the log has no ego at that instant the distance is inf. NaN: not known.
+
+    >>> cr.RadioPath(distance_m=np.array([120.0]), visible_share=np.array([0.4])).visible_share
+    array([0.4])
     """
 
     distance_m: Float
