@@ -11,8 +11,9 @@ Means over the rows that were detected, so that stages add up. An object listed 
 until it was listed. Of a confirmation only the newest capture is known: what it takes is spent *in sight*, as is the
 time in which another unit's list of the object is still on its way. Ideal fusion and the truth know from the list that
 brings it (one hit): all from its capture on is transport, nothing fusion. Otherwise transport is the latency, where all
-units have the same; else the two stages are one. So are the first two where it is not known when it was in sight: the
-truth needs no sight, and recorded units don't tell. With `count_earlier` times may be negative, and nothing is drawn.
+units have the same; else the two stages are one, and so they are where a link draws it. So are the first two where it
+is not known when it was in sight: the truth needs no sight, and recorded units don't tell. With `count_earlier` times
+may be negative, and nothing is drawn.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import Float
+from copem_replay.core.tracks import TRUTH, Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.receiver import by_truth
 from copem_replay.report.figures.captions import percent, short_names, study
@@ -147,7 +148,7 @@ def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[s
     by_id = by_truth(configuration) and not experiment.measure.match.always
     if by_id and experiment.measure.confirm.hits == 1:
         return {TRANSPORT: delay_s, FUSION: np.zeros_like(delay_s)}
-    latency_s = {configuration.latency_of(unit) for unit in units} or {configuration.latency_of("truth")}
+    latency_s = {experiment.delay_of(name, unit) for unit in units or (TRUTH,)}
     fixed_s = latency_s.pop() if len(latency_s) == 1 else None
     recorded = configuration.recorded is not None
     if recorded or fixed_s is None or any(unit in experiment.recorded for unit in units):
