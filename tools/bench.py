@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import os
+import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -299,7 +301,49 @@ def memory() -> Iterator[dict[str, object]]:
     yield from bench_memory.memory(*_loaded(ROOT / "logs/crossing.yaml"))
 
 
-BENCHES = (visibility, memory, paper, reading, writing, commands, reports, fusion, peers, links, crowd, long)
+def pieces() -> Iterator[dict[str, object]]:
+    """What keeping pieces costs, in CPU seconds of commands; and a finished study of 5,000 names, no log read."""
+    with _scratch() as folder:
+        kept, plain, keeping = str(folder / "kept"), [], []
+        command = ["run", str(ROOT / "logs/crossing_share.yaml"), "--overwrite", "--out", str(folder / "out")]
+        for _ in range(3):
+            plain.append(_cpu_seconds(command))
+            shutil.rmtree(kept, ignore_errors=True)
+            keeping.append(_cpu_seconds([*command, "--pieces", kept]))
+        before, after = float(np.median(plain)), float(np.median(keeping))
+        yield {"pieces_overhead": round(after / before - 1, 3), "seconds": round(before, 2)}
+        shutil.copy(ROOT / "logs/tc016d.mcap", folder / "0.mcap")
+        for k in range(1, 5000):
+            (folder / f"{k}.mcap").hardlink_to(folder / "0.mcap")
+        (folder / "names.yaml").write_text(NAMES)
+        command = ["run", str(folder / "names.yaml"), "--overwrite", "--out", str(folder / "many"), "--pieces", kept]
+        first = _cpu_seconds(command)
+        began = time.perf_counter()
+        yield {"resume_cpu_s": round(_cpu_seconds(command), 1), "seconds": round(time.perf_counter() - began, 1),
+               "first_cpu_s": round(first, 1)}  # fmt: skip
+
+
+NAMES = """\
+version: 1
+logs: ["*.mcap"]
+runs: 64
+show: null
+pems: {cam: [{detection: {kind: visible_share}}]}
+units: {ego: {on: ego, height_m: 1.8, pem: cam}}
+configurations: {alone: {units: [ego]}}
+measure: {accuracy: false}
+"""
+
+
+def _cpu_seconds(arguments: list[str]) -> float:
+    """Of a command, all its threads together."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-m", "copem_replay.cli.main", *arguments], check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+BENCHES = (pieces, visibility, memory, paper, reading, writing, commands, reports, fusion, peers, links, crowd, long)
 
 if __name__ == "__main__":
     main(sys.argv[1:])

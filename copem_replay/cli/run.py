@@ -12,7 +12,7 @@ import typer
 from copem_replay.cli.inspect import source_with
 from copem_replay.cli.options import Ego, ExperimentFile, FromS, Logs, ToS
 from copem_replay.cli.progress import with_progress
-from copem_replay.cli.terminal import note, say, width_of
+from copem_replay.cli.terminal import complain, note, say, width_of
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,11 +35,15 @@ def run(
     skip_unreadable: Annotated[
         bool, typer.Option("--skip-unreadable", help="Leave out recordings that cannot be replayed.")
     ] = False,
+    pieces: Annotated[
+        str | None, typer.Option(metavar="FOLDER", help="Where finished pieces are kept, and found again.")
+    ] = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
+    from copem_replay.cli.api.run import pieces_in
     from copem_replay.cli.api.study import prepared, read_study
     from copem_replay.results.place import check_inputs, taken
 
@@ -47,7 +51,8 @@ def run(
     with taken(out or Path("out") / experiment.stem, overwrite=overwrite) as place:
         note(place.notes)
         place.notes.clear()
-        study = read_study(source, skip_unreadable=skip_unreadable)
+        kept = None if pieces is None else pieces_in(pieces)
+        study = read_study(source, skip_unreadable=skip_unreadable, pieces=kept)
         check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
         url = _viewer(study.experiment, viewer) if live or viewer is not None else None
         from copem_replay.cli.api.run import fill, replayed
@@ -56,8 +61,11 @@ def run(
 
         ready, warnings = prepared(study)
         note(warnings)
-        result = with_progress("replaying", lambda progress: replayed(study, ready, jobs, progress))
+        result = with_progress("replaying", lambda progress: replayed(study, ready, jobs, progress, kept))
         notes = fill(place, result, skipped=study.skipped, viewer=url)
+        if kept is not None:
+            note(kept.damaged)
+            complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.root}"])
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
         note([*place.notes, *skipped, *notes, *result.replayed.costs])
         print(summary_text(result.summary, width_of(sys.stdout)))

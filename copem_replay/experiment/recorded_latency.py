@@ -64,6 +64,11 @@ class RecordedLatency(LatencyModel):
         self._sorted_s = tuple(np.sort(found).tolist())
         return self
 
+    @property
+    def sorted_s(self) -> tuple[float, ...]:
+        """What was recorded, in seconds."""
+        return self._sorted_s
+
     def delays(self, uniform: Float) -> Float:
         """(K,) quantiles: linear between the order statistics."""
         result: Float = np.quantile(np.array(self._sorted_s), uniform)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from copem_replay.core.errors import EgoError, RecordingError, printable
+from copem_replay.core.errors import EgoError, InputError, RecordingError, printable
 from copem_replay.core.text import unknown
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.cross_references import NO_EGO, references
@@ -102,8 +102,16 @@ def log_names(paths: Sequence[Path]) -> list[str]:
         depth = [d + twice for d, twice in zip(depth, again, strict=True)]
 
 
+Known = Callable[[Place, Experiment, Callable[[], Recording]], Recording | None]
+"""What is known from before of the recording at a place, in an experiment resolved for it, and how it is read; None:
+it has to be read."""
+
+
 def read_logs(
-    experiment: Experiment, paths: Mapping[Place, Key | None] | Iterable[Place], source: Source | None
+    experiment: Experiment,
+    paths: Mapping[Place, Key | None] | Iterable[Place],
+    source: Source | None,
+    known: Known | None = None,
 ) -> tuple[list[Recording], list[Refused]]:
     """The recordings that can be replayed, and what is wrong with those that cannot.
 
@@ -120,15 +128,27 @@ def read_logs(
             refused.append(Refused(next(gone), "no such file", key))
         elif (place := identity(path)) not in recordings:
             entry, settings = mine.get(place, (None, None))
-            recording, wrong = _read(experiment if settings is None else with_settings(experiment, settings), path)
+            alone = experiment if settings is None else with_settings(experiment, settings)
+            recording = None if known is None else known(path, alone, partial(_again, alone, path))
+            wrong: list[Refused] = []
+            if recording is None:
+                recording, wrong = _read(alone, path)
             refused += [log.within(entry, settings) for log in wrong]
             if recording is not None and not wrong:
                 again = names_of.get(place, [])
                 said = [f"named more than once ({', '.join(again)}): replayed once"] if len(again) > 1 else []
-                recordings[place] = replace(recording, notes=(*said, *recording.notes))
+                recordings[place] = replace(recording, notes=tuple(dict.fromkeys((*said, *recording.notes))))
     # Named when it is known which there are: the experiment that is written with the results names only these.
     given = {place: settings.name for place, (_, settings) in mine.items() if settings.name is not None}
     return _with_names(recordings, given), refused
+
+
+def _again(experiment: Experiment, place: Place) -> Recording:
+    """A recording that could be read before. Raises InputError where it no longer can."""
+    recording, wrong = _read(experiment, place)
+    if recording is None or wrong:
+        raise InputError([log.said(None) for log in wrong])
+    return recording
 
 
 def _with_names(recordings: Mapping[str, Recording], given: Mapping[str, str]) -> list[Recording]:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not
     from copem_replay.io.config import EgoTopic
     from copem_replay.io.recorded_osi import RecordedLists
     from copem_replay.io.schemas.object_lists import Fields
+    from copem_replay.io.survey import Survey
     from copem_replay.io.world_frame import LogContext
 
 _TOPIC = ("read", "topic")  # the key of an experiment that names the topic of the truth
@@ -63,6 +64,7 @@ class Recording:
     window: Window | None = None  # of log time, that was read; None: all
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
     together: Together | None = None  # the recordings of the drive, `path` being the first; None: it is one
+    survey: Survey | None = None  # where it was not read, but is known from before: no truth, no lists (`survey.whole`)
 
     @property
     def place(self) -> Place:

@@ -11,23 +11,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from copem_replay.core.tracks import Float, Int
-from copem_replay.metrics.accuracy.statistics import Accuracy, Total, total
-from copem_replay.pipeline.blocks import Outcome
-from copem_replay.pipeline.scoring import Scores
+from copem_replay.core.tracks import Float
+from copem_replay.metrics.accuracy.statistics import Accuracy, Total, joined
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.blocks import Outcome
+    from copem_replay.pipeline.log_tables import LogTables
+    from copem_replay.pipeline.scoring import Scores
 
 
 def with_accuracy(outcome: Outcome) -> pd.DataFrame:
     """The rows of `detections` with the figures of each."""
-    parts = [_row_columns(one) for _, _, one in _accuracies(outcome)]
+    parts = [_row_columns(one) for _, _, one in accuracies(outcome)]
     if not parts:
         return outcome.table
     more = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -57,33 +61,26 @@ def _row_columns(accuracy: Accuracy) -> dict[str, Any]:
     }
 
 
-def totals(outcomes: Iterable[Outcome]) -> dict[str, Total]:
+def accuracies(outcome: Outcome) -> Iterable[tuple[str, Scores, Accuracy]]:
+    """Of each configuration whose accuracy is measured."""
+    for name, scores in outcome.all_scores.items():
+        if scores.accuracy is not None:
+            yield name, scores, scores.accuracy
+
+
+def by_log(logs: Iterable[LogTables]) -> dict[tuple[str, str], Total]:
+    """Sums over the runs of each log and configuration."""
+    return {(log.log, name): joined(nodes) for log in logs for name, nodes in log.totals.items()}
+
+
+def totals(of_logs: Mapping[tuple[str, str], Total]) -> dict[str, Total]:
     """By configuration the sums over all runs and logs; nothing where there is no accuracy."""
     result: dict[str, Total] = {}
-    for (_, name), one in _by_log(outcomes).items():
+    for (_, name), one in of_logs.items():
         # Of time there are bands in each log, which do not add up over several.
         one = replace(one, settings=replace(one.settings, time_edges_s=()), by_time=one.by_time[:0])
         result[name] = result[name] + one if name in result else one
     return result
-
-
-def _by_log(outcomes: Iterable[Outcome]) -> dict[tuple[str, str], Total]:
-    """Sums over the runs of each log and configuration; how runs were cut into blocks makes no difference."""
-    parts: dict[tuple[str, str], list[tuple[int, Accuracy]]] = {}
-    for outcome in outcomes:
-        for name, _, one in _accuracies(outcome):
-            mine = parts.setdefault((outcome.log, name), [])
-            mine += (
-                [(int(run), one.of_run(s)) for s, run in enumerate(outcome.runs)]
-                if _scattered(outcome)
-                else [(int(outcome.runs[0]), one)]
-            )
-    return {key: total([one for _, one in sorted(mine, key=lambda part: part[0])]) for key, mine in parts.items()}
-
-
-def _scattered(outcome: Outcome) -> bool:
-    """Whether other outcomes have runs between these: where runs differ in their units."""
-    return bool((np.diff(outcome.runs) != 1).any())
 
 
 @dataclass(frozen=True)
@@ -97,150 +94,38 @@ class AccuracyTables:
     bands: pd.DataFrame
 
 
-def accuracy_tables(outcomes: Sequence[Outcome], order: Int, *, same_instants: bool) -> AccuracyTables:
-    """All tables of runs of several logs, `order (n,)` being that of the rows of all outcomes in `detections`."""
-    per_list = _per_list(outcomes).take(pa.array(order))
-    instants = _instants(outcomes) if same_instants else _instants_by_run(outcomes)
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    return AccuracyTables(per_list, instants, _lists(outcomes), _thresholds(outcomes, place), bands(outcomes))
+def accuracy_tables(
+    logs: Sequence[LogTables], of_logs: Mapping[tuple[str, str], Total], rows: pd.DataFrame, *, same_instants: bool
+) -> AccuracyTables:
+    """All tables of several logs; `of_logs`: their sums, `rows`: those of `detections`."""
+    keys = pa.Table.from_pandas(rows[["log", "configuration", "run", "object_id"]], preserve_index=False)
+    beside = pa.concat_tables([log.beside for log in logs if log.beside is not None])
+    runs = pa.concat_tables([log.runs for log in logs if log.runs is not None])
+    per_list = keys
+    for name in ("first_list", "error_m", "gospa_m2", "ghosts"):
+        per_list = per_list.append_column(name, beside[name])
+    lengths = pc.list_value_length(beside["existence"]).to_numpy()
+    thresholds = keys.take(pa.array(np.repeat(np.arange(len(lengths)), lengths)))
+    thresholds = thresholds.append_column("existence", pc.list_flatten(beside["existence"]))
+    thresholds = thresholds.append_column("detection_s", pc.list_flatten(beside["steps_s"]))
+    lists = runs.drop_columns("available_s")
+    return AccuracyTables(per_list, _instants(runs, same_instants), lists, thresholds, bands(of_logs))
 
 
-def _accuracies(outcome: Outcome) -> Iterable[tuple[str, Scores, Accuracy]]:
-    for name, scores in outcome.all_scores.items():
-        if scores.accuracy is not None:
-            yield name, scores, scores.accuracy
+def _instants(runs: pa.Table, same: bool) -> pa.Table:
+    """Of each configuration, and of each run where runs have units or outages, and so instants, of their own."""
+    columns = runs.select(["log", "configuration", "run", "available_s"])
+    if same:
+        return columns.filter(pc.equal(columns["run"], 0)).drop_columns("run")
+    said = np.flatnonzero(columns["available_s"].is_valid())
+    rows = said[np.searchsorted(said, np.arange(len(columns)), side="right") - 1]  # as in the row before
+    return columns.set_column(3, "available_s", columns["available_s"].take(pa.array(rows)))
 
 
-def _per_list(outcomes: Sequence[Outcome]) -> pa.Table:
-    first: list[Int] = []
-    lengths: list[Int] = [np.zeros(1, dtype=np.int64)]
-    error: list[Any] = []
-    gospa: list[Any] = []
-    ghosts: list[Int] = []
-    for outcome in outcomes:
-        runs = len(outcome.runs)
-        for _, _, one in _accuracies(outcome):
-            first.append(np.tile(one.first_list, runs))
-            lengths.append(np.tile(one.count, runs))
-            error.append(one.error_m.ravel())
-            gospa.append(one.gospa.ravel())
-            ghosts.append(one.by_object["ghosts"].ravel())
-    offsets = pa.array(np.cumsum(np.concatenate(lengths)), pa.int64())
-
-    def nested(parts: list[Any]) -> pa.Array:
-        # To about a millimetre: what is finer is noise, and takes twice the space.
-        values = np.round(np.concatenate([np.empty(0, dtype=np.float32), *parts]) * np.float32(1024)) / np.float32(1024)
-        return pa.LargeListArray.from_arrays(offsets, pa.array(values, mask=np.isnan(values)))
-
-    rows = pd.concat([outcome.table[["log", "configuration", "run", "object_id"]] for outcome in outcomes])
-    keys = pa.Table.from_pandas(rows, preserve_index=False)
-    none = np.empty(0, dtype=np.int64)
-    return (
-        keys.append_column("first_list", pa.array(np.concatenate([none, *first])))
-        .append_column("error_m", nested(error))
-        .append_column("gospa_m2", nested(gospa))
-        .append_column("ghosts", pa.array(np.concatenate([none, *ghosts])))
-    )
-
-
-def _instants(outcomes: Sequence[Outcome]) -> pa.Table:
-    rows: dict[tuple[str, str], Float] = {}
-    for outcome in outcomes:
-        for name, scores, _ in _accuracies(outcome):
-            rows.setdefault((outcome.log, name), scores.issue_s)
-    return pa.table(
-        {
-            "log": pa.array([log for log, _ in rows], pa.string()),
-            "configuration": pa.array([name for _, name in rows], pa.string()),
-            "available_s": pa.array([list(times) for times in rows.values()], pa.list_(pa.float64())),
-        }
-    )
-
-
-def _instants_by_run(outcomes: Sequence[Outcome]) -> pa.Table:
-    """The same with a row for every run, which has its own units or outages, and so its own instants."""
-    rows = [
-        (outcome.log, name, run, scores.issue_s)
-        for outcome in outcomes
-        for name, scores, _ in _accuracies(outcome)
-        for run in outcome.runs.tolist()
-    ]
-    places = {key: k for k, key in enumerate(dict.fromkeys(row[:2] for row in rows))}
-    rows.sort(key=lambda row: (places[row[:2]], row[2]))
-    return pa.table(
-        {
-            "log": pa.array([row[0] for row in rows], pa.string()),
-            "configuration": pa.array([row[1] for row in rows], pa.string()),
-            "run": pa.array([row[2] for row in rows], pa.int64()),
-            "available_s": pa.array([row[3] for row in rows], pa.list_(pa.float64())),
-        }
-    )
-
-
-def _lists(outcomes: Sequence[Outcome]) -> pa.Table:
-    rows: list[dict[str, Any]] = []
-    for outcome in outcomes:
-        for name, _, one in _accuracies(outcome):
-            for s, run in enumerate(outcome.runs.tolist()):
-                sums = one.by_run[s]
-                rows.append(
-                    {
-                        "log": outcome.log,
-                        "configuration": name,
-                        "run": run,
-                        "lists": int(sums["lists"]),
-                        "minutes": float(sums["time_s"]) / 60,
-                        "ghosts": int(sums["ghosts"]),
-                        "stale_ghosts": int(sums["stale_ghosts"]),
-                        "duplicates": int(sums["duplicates"]),
-                        "existence": list(one.settings.existence_thresholds),
-                        "ghosts_at": one.ghosts_at[s].tolist(),
-                    }
-                )
-    places = {key: k for k, key in enumerate(dict.fromkeys((row["log"], row["configuration"]) for row in rows))}
-    rows.sort(key=lambda row: (places[row["log"], row["configuration"]], row["run"]))
-    schema = pa.schema(
-        [
-            ("log", pa.string()), ("configuration", pa.string()), ("run", pa.int64()), ("lists", pa.int64()),
-            ("minutes", pa.float64()), ("ghosts", pa.int64()), ("stale_ghosts", pa.int64()), ("duplicates", pa.int64()),
-            ("existence", pa.list_(pa.float64())), ("ghosts_at", pa.list_(pa.int64())),
-        ]
-    )  # fmt: skip
-    return pa.Table.from_pylist(rows, schema)
-
-
-def _thresholds(outcomes: Sequence[Outcome], place: Int) -> pa.Table:
-    """Steps of all rows, in the order of `detections`."""
-    row: list[Int] = [np.empty(0, dtype=np.int64)]
-    existence: list[Float] = [np.empty(0)]
-    detection_s: list[Float] = [np.empty(0)]
-    before = 0
-    for outcome in outcomes:
-        runs = len(outcome.runs)
-        for name, scores in outcome.all_scores.items():
-            steps, episodes = scores.steps, scores.detections.detection_s.shape[1]
-            times = 1 if scores.detections.detection_s.shape[0] == runs else runs
-            for copy in range(times):  # one run stands for all
-                row.append(before + (steps.run_ix + copy) * episodes + steps.episode_ix)
-                existence.append(steps.existence)
-                detection_s.append(steps.detection_s)
-            before += runs * episodes
-            assert (outcome.table["configuration"] == name).sum() == runs * episodes
-    rows = place[np.concatenate(row)]
-    order = np.argsort(rows, kind="stable")
-    keys = pd.concat([outcome.table[["log", "configuration", "run", "object_id"]] for outcome in outcomes])
-    back = np.empty(len(place), dtype=np.int64)
-    back[place] = np.arange(len(place))
-    table = pa.Table.from_pandas(keys, preserve_index=False).take(pa.array(back[rows[order]]))
-    table = table.append_column("existence", pa.array(np.concatenate(existence)[order]))
-    return table.append_column("detection_s", pa.array(np.concatenate(detection_s)[order]))
-
-
-def bands(outcomes: Sequence[Outcome]) -> pd.DataFrame:
+def bands(of_logs: Mapping[tuple[str, str], Total]) -> pd.DataFrame:
     """How good the lists were by distance, over time and by existence."""
     rows: list[dict[str, Any]] = []
-    for name, of in totals(outcomes).items():
+    for name, of in totals(of_logs).items():
         rows += _band_rows(name, "distance_m", of.settings.distance_edges_m, of.by_distance, None)
         edges = np.linspace(0.0, 1.0, len(of.by_existence) + 1)
         for k, sums in enumerate(of.by_existence):
@@ -252,7 +137,7 @@ def bands(outcomes: Sequence[Outcome]) -> pd.DataFrame:
                         "with_object_share": sums["with_object"] / sums["entries"],
                     }
                 )  # fmt: skip
-    for (log, name), of in _by_log(outcomes).items():
+    for (log, name), of in of_logs.items():
         rows += _band_rows(name, "time_s", of.settings.time_edges_s, of.by_time, log)
     columns = ["log", "configuration", "by", "from", "to", "looked", "missed_share", "ghosts", "pairs",
                "position_rmse_m", "bias_east_m", "bias_north_m", "nees", "nees_expected", "entries", "existence",

@@ -53,21 +53,22 @@ class Outcome:
     accuracy_s: float
 
 
-def blocks(replay: Replay, experiment: Experiment, jobs: int) -> list[Int]:
-    """The runs cut into blocks, small enough for memory and enough of them for the workers."""
+def blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, int] | None = None) -> list[Int]:
+    """The runs, or those from … up to, cut into blocks, small enough for memory and enough of them for the workers."""
+    begin, end = runs or (0, experiment.runs)
     states = _needs_all(experiment) or experiment.measure.conflict is not None
     if len(replay.chunks) > 1:
         rows = ROWS_A_CHUNK
     else:
         found = replay.found(WHOLE) if _needs_all(experiment) else replay.measured
         rows = max(len(found.tracks.frame_ix), 1)
-    even = -(-experiment.runs // jobs)
+    even = -(-(end - begin) // jobs)
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
     small = max(-(-even // 8), WORTH_A_BLOCK // rows)
     lasts = any(pem.memory_of(c).get("detection") for pem in experiment.pems.values() for c in range(len(pem.couples)))
     at_once = BLOCK_BYTES // (rows * (STATE_BYTES if states else LASTING_BYTES if lasts else 1))
     size = max(1, min(at_once, even, small))
-    return [np.arange(k, min(k + size, experiment.runs)) for k in range(0, experiment.runs, size)]
+    return [np.arange(k, min(k + size, end)) for k in range(begin, end, size)]
 
 
 def _needs_all(experiment: Experiment) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Float, Int
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.link_times import LinkTimes, link_times
-from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.prepare import Replay
 
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
@@ -30,9 +33,17 @@ class ListTimes:
         """Fused lists per second; None: there are no two."""
         return self.intervals / self.covered_s if self.covered_s > 0 else None
 
+    @classmethod
+    def read(cls, said: dict[str, Any]) -> Self:
+        """From JSON."""
+        links = said["links"]
+        if links is not None:
+            links = LinkTimes(**links | {name: np.array(links[name]) for name in ("from_s", "to_s")})
+        return cls(said["intervals"], said["covered_s"], links)
 
-def list_times(replay: Replay, experiment: Experiment) -> dict[str, list[ListTimes]]:
-    """By configuration what there is of each run, or of the one that stands for all.
+
+def list_times(replay: Replay, experiment: Experiment) -> dict[str, ListTimes]:
+    """By configuration what there is of all runs, or of the one that stands for all.
 
     Units that only some runs have are taken to be there.
     """
@@ -41,7 +52,7 @@ def list_times(replay: Replay, experiment: Experiment) -> dict[str, list[ListTim
     for run in range(experiment.runs if world.experiment.arrivals_differ else 1):
         alone = np.array([run])
         _add(result, replace(world, on_air=replay.on_air(experiment, alone)), alone)
-    return result
+    return {name: together(runs) for name, runs in result.items()}
 
 
 def together(times: Iterable[ListTimes]) -> ListTimes:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,8 +24,10 @@ from copem_replay.perception.pem.ghosts import Beside
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.output_times import notes_on_outputs
-from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sweep import without_points
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.prepare import Replay
 
 FAR_M = 2000.0
 """A place farther away from all objects is taken for a mistake (chosen: no sensor beside a road sees so far)."""
@@ -37,11 +40,19 @@ def notes_of(
     recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
 ) -> list[str]:
     """What has to be said of the recordings, and of them and the experiment together: after a replay, or before."""
+    odd = {
+        replay.scene.log: oddities(replay, of_log(experiment, replay.scene.log), replay.ever_met if replayed else None)
+        for replay in ready
+    }
+    return study_notes(recordings, odd, experiment)
+
+
+def study_notes(
+    recordings: Sequence[Recording], oddities_of: Mapping[str, Iterable[str]], experiment: Experiment
+) -> list[str]:
+    """The same, with what is odd about each log."""
     notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
-    for replay in ready:
-        met = replay.ever_met if replayed else None
-        alone = of_log(experiment, replay.scene.log)
-        notes += [f"{replay.scene.log}: {note}" for note in oddities(replay, alone, met)]
+    notes += [f"{log}: {note}" for log, odd in oddities_of.items() for note in odd]
     notes += settings_notes(experiment)
     notes += without_points(experiment)
     notes += _remembered_in_vain(experiment)

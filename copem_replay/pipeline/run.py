@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.fixed import fixed_in
+from copem_replay.metrics.output_times import OutputTimes
 from copem_replay.metrics.summary import horizon_s, own_sums_of, summary_of
 from copem_replay.metrics.tally import tally
-from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, totals, with_accuracy
-from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
-from copem_replay.pipeline.closed_form import check_exact, exact_table
-from copem_replay.pipeline.cost import Cost, watched
-from copem_replay.pipeline.list_rates import ListTimes, list_times, together
+from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, by_log, totals
+from copem_replay.pipeline.closed_form import check_exact
+from copem_replay.pipeline.cost import watched
+from copem_replay.pipeline.facts import Facts
+from copem_replay.pipeline.gather import Gatherer, Progress, frame_of
+from copem_replay.pipeline.list_rates import ListTimes, together
 from copem_replay.pipeline.memory import memory_notes
-from copem_replay.pipeline.notes import notes_of, same_instants
-from copem_replay.pipeline.output_times import output_times
+from copem_replay.pipeline.notes import study_notes
+from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.pipeline.study_log import StudyLog
 from copem_replay.pipeline.sweep import Point, points
-
-Progress = Callable[[int, int], None]
-"""`progress(done, total)`, called after each block of runs."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +43,8 @@ class Result:
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
     costs: tuple[str, ...] = ()  # what has to be said on the terminal alone: no two runs take the same time
     tally: pd.DataFrame = field(default_factory=pd.DataFrame)  # tally.parquet
+    logs: tuple[StudyLog, ...] = ()
+    facts: tuple[Facts, ...] = ()  # of each log
 
 
 def run(
@@ -56,28 +54,32 @@ def run(
     jobs: int = 1,
     progress: Progress | None = None,
     ready: Sequence[Replay] | None = None,
+    pieces: Pieces | None = None,
 ) -> Result:
     """Replay logs through an experiment. The result does not depend on `jobs`, nor on how runs are cut into blocks.
 
-    `ready`: the logs as they were prepared and checked before. Raises ExperimentError before any run: something that
-    has no closed form, runs that no memory holds.
+    `ready`: the logs as they were prepared and checked before. `pieces`: where what is computed is kept and found.
+    Raises ExperimentError before any run: something that has no closed form, runs that no memory holds.
     """
     with watched() as cost:
-        if ready is None:
+        if ready is None and pieces is None:
             ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
             check_closed_form(ready, experiment)
             memory_notes(ready, experiment)
-        tables = _Tables(jobs, progress, 1 + sum(1 for _ in points(experiment)), cost)
-        result = _run(experiment, recordings, ready, tables)
+        by_name = {replay.scene.log: replay for replay in ready or ()}
+        logs = [StudyLog(r, experiment, pieces, by_name.get(r.scene.log)) for r in recordings]
+        gatherer = Gatherer(jobs, progress, 1 + sum(1 for _ in points(experiment)), cost, pieces)
+        result = _run(experiment, logs, gatherer)
     return replace(result, costs=cost.notes())
 
 
-def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables) -> Result:
-    exact = _exactly(ready, experiment)
-    table, parts, order = tables.of(ready, experiment)
-    tallied = tally(table)
+def _run(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> Result:
+    exact = _exactly(logs, experiment, gatherer)
+    tables = gatherer.of(logs, experiment)
+    table = frame_of([of.rows for of in tables])
+    facts, tallied, of_logs = [log.facts(experiment) for log in logs], tally(table), by_log(tables)
     horizon = horizon_s(tallied, experiment.measure.horizon_s)
-    times = _times(ready, experiment)
+    times = _times(facts, experiment)
     rows, said = summary_of(
         tallied,
         list(experiment.configurations),
@@ -85,21 +87,25 @@ def _run(experiment: Experiment, recordings: Sequence[Recording], ready: Sequenc
         seed=experiment.seed,
         horizon_s=horizon,
         exact=exact,
-        accuracy=totals(parts),
+        accuracy=totals(of_logs),
         fixed=fixed_in(experiment.as_written()),
         own=experiment.measure.metrics,
         sums=own_sums_of(table, experiment.measure.metrics),
-        outputs=output_times(recordings, experiment),
+        outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
     )
-    swept = [_at_point(point, recordings, ready, tables, horizon) for point in points(experiment)]
-    notes = notes_of(recordings, ready, experiment, replayed=True)
+    swept = [_at_point(point, logs, gatherer, horizon) for point in points(experiment)]
+    recordings = [log.recording for log in logs]
+    notes = study_notes(recordings, {log.name: of.oddities for log, of in zip(logs, facts, strict=True)}, experiment)
     sweep = pd.concat(swept, ignore_index=True) if swept else None
     accuracy = None
     if experiment.measure.accuracy and len(experiment.configurations):
-        accuracy = accuracy_tables(parts, order, same_instants=same_instants(ready))
-    return Result(table, rows, (*notes, *said), tuple(ready), horizon, exact, accuracy, sweep, tally=tallied)
+        alike = all(of.same_instants for of in facts)
+        accuracy = accuracy_tables(tables, of_logs, table, same_instants=alike)
+    ready = tuple(log.ready for log in logs if log.ready is not None)
+    result = Result(table, rows, (*notes, *said), ready, horizon, exact, accuracy, sweep)
+    return replace(result, tally=tallied, logs=tuple(logs), facts=tuple(facts))
 
 
 def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
@@ -110,23 +116,21 @@ def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
             check_exact(ready, point.experiment)
 
 
-def _at_point(
-    point: Point, recordings: Sequence[Recording], ready: Sequence[Replay], tables: _Tables, horizon: float | None
-) -> pd.DataFrame:
+def _at_point(point: Point, logs: Sequence[StudyLog], gatherer: Gatherer, horizon: float | None) -> pd.DataFrame:
     """The rows of `sweep.csv` of one point: summaries of its configurations, at the horizon of the experiment."""
     experiment = point.experiment
     if not point.same_units:
-        ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
-    table, parts, _ = tables.of(ready, experiment)
-    times = _times(ready, experiment)
+        logs = [StudyLog(log.recording, experiment, log.pieces) for log in logs]
+    exact, tables = _exactly(logs, experiment, gatherer), gatherer.of(logs, experiment)
+    times = _times([log.facts(experiment) for log in logs], experiment)
     rows, _ = summary_of(
-        tally(table),
+        tally(frame_of([of.rows for of in tables])),
         list(experiment.configurations),
         {name: one.rate_hz for name, one in times.items()},
         seed=experiment.seed,
         horizon_s=horizon,
-        exact=_exactly(ready, experiment),
-        accuracy=totals(parts),
+        exact=exact,
+        accuracy=totals(by_log(tables)),
         fixed=fixed_in(experiment.as_written()),
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
@@ -136,55 +140,14 @@ def _at_point(
     return rows
 
 
-def _exactly(ready: Sequence[Replay], experiment: Experiment) -> pd.DataFrame | None:
+def _exactly(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer) -> pd.DataFrame | None:
     if not experiment.measure.exact:
         return None
-    return pd.concat([exact_table(replay, of_log(experiment, replay.scene.log)) for replay in ready], ignore_index=True)
+    return pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)
 
 
-class _Tables:
-    """Tables of all logs and runs, computed in blocks by several workers; tells how far it is."""
-
-    def __init__(self, jobs: int, progress: Progress | None, tables: int, cost: Cost) -> None:
-        self._jobs, self._progress, self._tables, self._done, self._cost = jobs, progress, tables, 0, cost
-
-    def of(
-        self, ready: Sequence[Replay], experiment: Experiment
-    ) -> tuple[pd.DataFrame, list[Outcome], NDArray[np.int64]]:
-        """The rows of `detections.parquet` of an experiment; all outcomes, and the order their rows have got."""
-        work = [
-            (replay, alone, block)
-            for replay in ready
-            for alone in (of_log(experiment, replay.scene.log),)
-            for block in blocks(replay, alone, self._jobs)
-        ]
-        parts: list[list[Outcome]] = []
-        pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
-        try:
-            for part in pool.map(lambda item: outcomes(*item), work):
-                parts.append(part)
-                if self._progress is not None:
-                    self._progress(self._done * len(work) + len(parts), self._tables * len(work))
-        finally:  # interrupted: what has not begun never does
-            pool.shutdown(cancel_futures=True)
-        self._done += 1
-        every = [outcome for part in parts for outcome in part]
-        self._cost.add(time.perf_counter() - began_s, every)
-        table = pd.concat([with_accuracy(outcome) for outcome in every], ignore_index=True)
-        order = _order(table, [replay.scene.log for replay in ready], experiment)
-        return table.iloc[order].reset_index(drop=True), every, order
-
-
-def _order(table: pd.DataFrame, logs: list[str], experiment: Experiment) -> NDArray[np.int64]:
-    """The order (n,) of rows by log, configuration, run and object, however the runs were cut into blocks."""
-    log = table["log"].map({name: k for k, name in enumerate(logs)}).to_numpy()
-    configuration = table["configuration"].map({n: k for k, n in enumerate(experiment.configurations)}).to_numpy()
-    return np.lexsort((table["run"].to_numpy(), configuration, log))
-
-
-def _times(ready: Sequence[Replay], experiment: Experiment) -> dict[str, ListTimes]:
-    of_logs = [list_times(replay, of_log(experiment, replay.scene.log)) for replay in ready]
-    return {name: together(one for log in of_logs for one in log.get(name, ())) for name in experiment.configurations}
+def _times(facts: Sequence[Facts], experiment: Experiment) -> dict[str, ListTimes]:
+    return {name: together(of.times[name] for of in facts if name in of.times) for name in experiment.configurations}
 
 
 def log_path_of(recordings: Sequence[Recording], log: str) -> Path:

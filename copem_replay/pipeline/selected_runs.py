@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,9 @@ from copem_replay.io.recording import Recording
 from copem_replay.pipeline.expansion import of_run
 from copem_replay.pipeline.one_run import RunTracks
 from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.run import Result
+
+if TYPE_CHECKING:
+    from copem_replay.pipeline.run import Result
 
 STEM = "replay"
 """What the files are called; those of the second run on `replay_<as which it was asked for>`."""
@@ -68,7 +71,7 @@ def _counted(number: int, what: str) -> str:
 
 def shown_logs(experiment: Experiment, result: Result) -> list[str]:
     """Names of the logs that are written to MCAP and .rrd."""
-    names = [replay.scene.log for replay in result.replays]
+    names = [log.name for log in result.logs] or [replay.scene.log for replay in result.replays]
     if experiment.show is None or not experiment.show.asked():
         return []
     wanted = experiment.show.logs

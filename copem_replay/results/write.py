@@ -23,9 +23,7 @@ from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.file import at_place
 from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import place_of
-from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
-from copem_replay.io.truth_digest import truth_digest
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
@@ -39,6 +37,8 @@ _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
     "scipy", "shapely",
 )  # fmt: skip
+ROWS_A_GROUP = 1 << 20
+"""Rows of a row group of Parquet, at most (that is Arrow's)."""
 _ACCURACY = ("accuracy", "instants", "lists", "thresholds")
 
 
@@ -77,6 +77,7 @@ def fill_place(
     try:
         place.will_hold(files)
         notes = _fill(place, experiment, recordings, result, exporters)
+        write_csv(_logs(place.folder, result, skipped), place.new / "logs.csv")
         provenance = provenance_of(experiment, recordings, result, skipped, notes) | {"files": files}
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         place.finish(files)
@@ -89,7 +90,7 @@ def _files(
     experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
 ) -> list[str]:
     """What is going to be in the folder, by names relative to it."""
-    files = [EXPERIMENT, MARK, "detections.parquet", "tally.parquet", "summary.csv"]
+    files = [EXPERIMENT, MARK, "detections.parquet", "tally.parquet", "summary.csv", "logs.csv"]
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
     if result.accuracy is not None:
         files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
@@ -142,6 +143,29 @@ def _recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
     return [one for one in found if isinstance(one, dict) and one.get("kind") == "recorded"]
 
 
+def _logs(folder: Path, result: Result, skipped: Sequence[tuple[Path, str]]) -> pd.DataFrame:
+    """The rows of `logs.csv`: what became of each log."""
+    counts = result.table.groupby("log").size()
+    rows = [
+        {
+            "log": log.name,
+            "path": _utf8(" + ".join(os.path.relpath(place_of(path), folder) for path in log.recording.paths)),
+            "sha256": log.digests["sha256"],
+            "episodes": facts.episodes,
+            "rows": int(counts.get(log.name, 0)),
+            "state": "done",
+        }
+        for log, facts in zip(result.logs, result.facts, strict=True)
+    ]
+    rows += [
+        {"log": None, "path": _utf8(os.path.relpath(place_of(path), folder)), "state": "skipped", "reason": _utf8(why)}
+        for path, why in skipped
+    ]
+    columns = {"log": "object", "path": "object", "sha256": "object", "episodes": "Int64", "rows": "Int64",
+               "state": "object", "reason": "object"}  # fmt: skip
+    return pd.DataFrame(rows, columns=list(columns)).astype(columns)
+
+
 def _entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
     """`logs` as the folder has it: a path relative to it each, with the log's settings where it has some."""
 
@@ -159,7 +183,8 @@ def _run_to_export(
     log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
 ) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
-    recording = next(r for r in recordings if r.scene.log == log)
+    of_study = next(one for one in result.logs if one.name == log)
+    replay, recording = of_study.replay(), of_study.recording
     experiment = of_log(experiment, log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
     names = list(chosen.configurations)
@@ -174,7 +199,7 @@ def _run_to_export(
     return RunToExport(
         recording,
         shown,
-        one_run(recording, chosen, shown.run, next(r for r in result.replays if r.scene.log == log)),
+        one_run(recording, chosen, shown.run, replay),
         experiment.configurations,
         result.table[of_run & result.table["configuration"].isin(names)],
         result.summary[result.summary["configuration"].isin(names)],
@@ -199,13 +224,8 @@ def provenance_of(
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
-            {
-                "log": r.scene.log,
-                "topic": r.topic,
-                "sha256": sha256_of(r.place),
-                "truth": truth_digest(r.scene, r.truth),
-            }
-            for r in recordings
+            {"log": log.name, "topic": log.recording.topic, **{n: log.digests[n] for n in ("sha256", "truth")}}
+            for log in result.logs
         ],
         "logs_skipped": [{"log": _utf8(path.name), "reason": reason} for path, reason in skipped],
         "visibility": experiment.visibility.label,
@@ -234,7 +254,10 @@ def write_parquet(table: Any, path: Path) -> None:
 
     arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
     fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
-    parquet.write_table(arrow.cast(pa.schema(fields, arrow.schema.metadata)), path, compression="zstd")
+    arrow = arrow.cast(pa.schema(fields, arrow.schema.metadata))
+    with parquet.ParquetWriter(path, arrow.schema, compression="zstd") as writer:
+        for k in range(0, max(len(arrow), 1), ROWS_A_GROUP):  # of one piece each, however the table was put together
+            writer.write_table(arrow.slice(k, ROWS_A_GROUP).combine_chunks(), row_group_size=ROWS_A_GROUP)
 
 
 def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:

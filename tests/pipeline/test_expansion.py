@@ -735,9 +735,9 @@ def test_the_run_that_is_shown_has_its_own_units(
     folder = tmp_path / "out" / "e"
     names = {path.name for path in folder.iterdir()}
     assert names == {
-        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "summary.csv", "exact.parquet",
-        "replay.mcap", "replay.rrd", "bands.csv", "lists.parquet", "thresholds.parquet", "accuracy.parquet",
-        "instants.parquet",
+        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
+        "exact.parquet", "replay.mcap", "replay.rrd", "bands.csv", "lists.parquet", "thresholds.parquet",
+        "accuracy.parquet", "instants.parquet",
     }  # fmt: skip
     # Lists of a run come when its own units send them: there are no instants that all runs have.
     assert "run" in pd.read_parquet(folder / "instants.parquet")

@@ -105,7 +105,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
     write_results(folder, chosen, recordings, result, exporters=EXPORTERS)
     names = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert names == {
-        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "summary.csv",
+        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
         "replay/near/drive.mcap", "replay/near/drive.rrd", "replay/far/drive.mcap", "replay/far/drive.rrd", *TABLES,
     }  # fmt: skip
     table = parquet.read_table(folder / "detections.parquet")
@@ -144,7 +144,7 @@ def test_without_accuracy_nothing_tells_of_it(two_logs: list[Path], tmp_path: Pa
     folder = tmp_path / "out"
     write_results(folder, chosen, recordings, run(chosen, recordings), exporters=EXPORTERS)
     assert {path.name for path in folder.iterdir()} == {
-        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "summary.csv",
+        "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "summary.csv",
     }  # fmt: skip
     assert parquet.read_table(folder / "detections.parquet").column_names == list(COLUMNS)
     assert list(pd.read_csv(folder / "summary.csv")) == SUMMARY

@@ -418,7 +418,7 @@ class TestRun:
         assert ended.out.endswith("results in out/e\nnext: copem-replay report out/e\n")
         assert sorted(written(here / "out" / "e")) == [
             "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
-            "lists.parquet", "provenance.json", "summary.csv", "tally.parquet", "thresholds.parquet",
+            "lists.parquet", "logs.csv", "provenance.json", "summary.csv", "tally.parquet", "thresholds.parquet",
         ]  # fmt: skip
         assert os.listdir(here / "out") == ["e"]
         assert set(table(here / "out" / "e")["configuration"]) == {"GT", "PEM", "coPEM"}

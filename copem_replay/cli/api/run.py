@@ -20,11 +20,13 @@ from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.run import Progress, Result
+from copem_replay.pipeline.gather import Progress
+from copem_replay.pipeline.run import Result
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from copem_replay.pipeline.pieces import Pieces
     from copem_replay.pipeline.prepare import Replay
     from copem_replay.results.place import Place
 
@@ -131,12 +133,14 @@ def run(
     recordings: AnyRecordings | None = None,
     jobs: int | None = None,
     progress: Progress | None = None,
+    pieces: AnyPath | None = None,
 ) -> StudyResult:
     """Replay recordings through an experiment, and measure.
 
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
     paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
-    depend on it. `progress(done, total)` is called after each block of runs.
+    depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder in which what was
+    computed is kept, and found by the next run (docs/scale.md).
 
     Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
     both together, times without a closed form, runs that no memory holds.
@@ -145,15 +149,33 @@ def run(
     >>> result.summary["ttd_median_s"].round(3).tolist()
     [0.0, 0.8, 0.0, 0.5, 1.0, 1.5]
     """
-    study = study_of(experiment, recordings)
-    return replayed(study, prepared(study)[0], jobs, progress)
+    kept = None if pieces is None else pieces_in(str(pieces))
+    study = study_of(experiment, recordings, kept)
+    return replayed(study, prepared(study)[0], jobs, progress, kept)
 
 
-def replayed(study: Study, ready: Sequence[Replay], jobs: int | None, progress: Progress | None) -> StudyResult:
+def pieces_in(url: str) -> Pieces:
+    """A folder of pieces. Raises InputError, OutputError."""
+    from copem_replay.pipeline.pieces import Pieces
+
+    if "://" in url:
+        raise InputError(f"--pieces: expected a folder, found {url}")
+    return Pieces(Path(url))
+
+
+def replayed(
+    study: Study,
+    ready: Sequence[Replay],
+    jobs: int | None,
+    progress: Progress | None,
+    pieces: Pieces | None = None,
+) -> StudyResult:
     """Replay a study whose logs are prepared."""
     from copem_replay.pipeline.run import run as replay
 
-    result = replay(study.experiment, study.recordings, jobs=workers(jobs), progress=progress, ready=ready)
+    result = replay(
+        study.experiment, study.recordings, jobs=workers(jobs), progress=progress, ready=ready, pieces=pieces
+    )
     return StudyResult(study.experiment, study.recordings, result)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -17,6 +18,7 @@ from copem_replay.experiment.validate import across_logs, against_log, bound, lo
 from copem_replay.io.recording import Recording
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
+    from copem_replay.pipeline.pieces import Pieces
     from copem_replay.pipeline.prepare import Replay
 
 AnyPath: TypeAlias = str | PathLike[str]
@@ -72,14 +74,14 @@ def _examined(source: Source, given: Experiment | None) -> tuple[Experiment | No
     return given, [*references(source), *log_paths(source)[1]]
 
 
-def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None) -> Study:
+def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None, pieces: Pieces | None = None) -> Study:
     """An experiment with its recordings: those it names (None), those at some paths, or those that are read already.
 
     Raises InputError with all problems of the experiment and of the recordings.
     """
     source, given = source_of(experiment)
     if recordings is None:
-        return read_study(source, given)
+        return read_study(source, given, pieces=pieces)
     listed = [recordings] if isinstance(recordings, Recording | str | PathLike) else list(recordings)
     paths = tuple(str(Path(one.path if isinstance(one, Recording) else one)) for one in listed)
     if not paths:
@@ -87,18 +89,28 @@ def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None)
     source = with_logs(source, paths, "recordings")
     read = [one for one in listed if isinstance(one, Recording)]
     if not read:
-        return read_study(source, given)
+        return read_study(source, given, pieces=pieces)
     if len(read) < len(listed):
         raise InputError("recordings: expected either recordings or paths, found both")
     return _study_with(source, given, read)
 
 
-def read_study(source: Source, given: Experiment | None = None, *, skip_unreadable: bool = False) -> Study:
-    """Read the recordings of an experiment. Raises InputError with every problem of it and of them."""
+def read_study(
+    source: Source, given: Experiment | None = None, *, skip_unreadable: bool = False, pieces: Pieces | None = None
+) -> Study:
+    """Read the recordings of an experiment, but those that are known to `pieces`.
+
+    Raises InputError with every problem of it and of them.
+    """
     experiment, found = _examined(source, given)
     if experiment is None:
         raise ExperimentError(found)
-    recordings, refused = read_logs(experiment, log_paths(source)[0], source)
+    known = None
+    if pieces is not None:
+        from copem_replay.pipeline.study_log import known_log
+
+        known = partial(known_log, pieces)
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source, known)
     if not recordings and not refused and not found:
         found.append(source.at(("logs",), "expected at least one recording, found none"))
     if not skip_unreadable or not recordings:
@@ -155,14 +167,15 @@ def _misread(experiment: Experiment, recording: Recording) -> Iterator[str]:
 
 
 def prepared(study: Study) -> tuple[list[Replay], list[str]]:
-    """The logs made ready to be replayed, and what has to be said before any run.
+    """The logs that were read made ready to be replayed, and what has to be said before any run.
 
     Raises ExperimentError for what cannot be done with them: times without a closed form, runs that no memory holds.
     """
     from copem_replay.pipeline.memory import memory_notes
     from copem_replay.pipeline.prepare import prepare
 
-    ready = [prepare(recording, of_log(study.experiment, recording.scene.log)) for recording in study.recordings]
+    read = [recording for recording in study.recordings if recording.survey is None]
+    ready = [prepare(recording, of_log(study.experiment, recording.scene.log)) for recording in read]
     key: tuple[str, ...] = ("measure", "exact")
     try:
         if study.experiment.measure.exact:

@@ -1,0 +1,197 @@
+"""Pieces that are kept: a folder in which what was computed once is found again, by the key of its recipe.
+
+    pieces/ab/<key>.parquet        rows of `detections.parquet`, and what stands beside them; the recipe in the metadata
+    pieces/ab/<key>.sums.parquet   a row per run, sums of accuracy in the metadata; written first
+    logs/<key>.json                what is known of a log, so that it need not be read again
+
+A piece is done when its `.parquet` is there. Two that write the same piece write the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from pyarrow import parquet
+
+from copem_replay.core.errors import OutputError
+from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Settings, Total
+from copem_replay.pipeline.log_tables import BESIDE, RUNS, LogTables
+from copem_replay.pipeline.recipe import canonical, key_of
+
+ROWS_A_PIECE = 250_000
+"""Rows of a range of runs at most (chosen: some MB)."""
+FIRST_RUNS = 64
+"""Runs of the first range (chosen)."""
+_BESIDE = "beside:"
+"""Before names of columns that stand beside rows."""
+_SEAL, _ZEROS = b"seal:", b"0" * 40
+_WHOSE = ("log", "configuration")
+_RECORDS = {"episodes": OBJECT, "runs": RUN, "ghosts_at": np.dtype("i8"), "by_distance": BAND, "by_time": BAND,
+            "by_existence": EXISTENCE}  # fmt: skip
+
+
+def ranges(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
+    """The ranges of runs that are pieces: of 64, 64, 128, … up to a power of two, then of as many, the last cut.
+
+    They depend on nothing but the log and what is measured in it, so that more runs find what is there.
+    """
+    most = max(1, ROWS_A_PIECE // max(episodes, 1))
+    most = 1 << most.bit_length() - 1
+    begin, size = 0, min(FIRST_RUNS, most)
+    while begin < runs:
+        yield begin, min(begin + size, runs)
+        begin += size
+        size = min(begin, most)
+
+
+class Pieces:
+    """A folder of pieces. `found`, `computed`: how many so far; `damaged`: those that had to be computed again."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.found = self.computed = 0
+        self.damaged: list[str] = []
+        try:
+            for name in ("pieces", "logs"):
+                (root / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"--pieces: {root}: cannot be written: {error.strerror or error}") from error
+
+    def read(self, recipe: str, log: str, configuration: str) -> LogTables | None:
+        """A piece of a log and configuration; None: it is not there, or damaged."""
+        place = self._place(recipe)
+        if not place.is_file():
+            return None
+        try:
+            piece = _read(place, recipe, log, configuration)
+        except (OSError, ValueError, KeyError, TypeError) as error:  # what Arrow raises derives from these
+            self.damaged.append(f"{place}: damaged, computed again ({' '.join(str(error).split())[:120]})")
+            return None
+        self.found += 1
+        return piece
+
+    def write(self, recipe: str, piece: LogTables) -> LogTables:
+        """Keep a piece. Returns it as it will be read. Raises OutputError."""
+        assert isinstance(piece.rows, pd.DataFrame)
+        place, rows = self._place(recipe), pa.Table.from_pandas(piece.rows, preserve_index=False)
+        said = {b"recipe": recipe.encode()}
+        table = rows.drop_columns(list(_WHOSE))
+        if piece.beside is not None and piece.runs is not None:
+            totals = canonical([[count, _as_json(of)] for nodes in piece.totals.values() for count, of in nodes])
+            sums = _sealed(piece.runs.drop_columns(list(_WHOSE)), {b"sums": totals.encode()})
+            self._put(place.with_suffix(".sums.parquet"), sums)
+            said[b"sums"] = _digest(sums)
+            for name in piece.beside.column_names:
+                table = table.append_column(_BESIDE + name, piece.beside[name])
+        self._put(place, _sealed(table, said))
+        self.computed += 1
+        return LogTables(piece.log, rows, piece.beside, piece.runs, piece.totals)
+
+    def known(self, about: str) -> dict[str, Any] | None:
+        """What is known of a log, by all that it was made of; None: nothing."""
+        try:
+            said: Any = json.loads((self.root / "logs" / f"{key_of(about)}.json").read_bytes())
+            digest = said.pop("digest")
+        except (OSError, ValueError, KeyError, AttributeError):
+            return None
+        return said if digest == key_of(canonical(said)) else None
+
+    def keep(self, about: str, said: Mapping[str, Any]) -> None:
+        """And for the next time. Raises OutputError."""
+        text = canonical(dict(said) | {"digest": key_of(canonical(said))})
+        self._put(self.root / "logs" / f"{key_of(about)}.json", text.encode())
+
+    def _place(self, recipe: str) -> Path:
+        key = key_of(recipe)
+        return self.root / "pieces" / key[:2] / f"{key}.parquet"
+
+    def _put(self, place: Path, content: bytes) -> None:
+        """Complete under its name, or not there."""
+        try:
+            place.parent.mkdir(exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=place.parent, prefix=f".{place.name}.", delete=False) as file:
+                try:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                    os.replace(file.name, place)
+                except BaseException:
+                    Path(file.name).unlink(missing_ok=True)
+                    raise
+        except OSError as error:
+            raise OutputError(f"{place}: cannot be written: {error.strerror or error}") from error
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=20).hexdigest().encode()
+
+
+def _sealed(table: pa.Table, said: Mapping[bytes, bytes]) -> bytes:
+    """A table as Parquet with its own digest in the metadata: that of the file with zeros in the digest's place."""
+    stream = pa.BufferOutputStream()
+    table = table.replace_schema_metadata({**said, _SEAL[:-1]: _SEAL + _ZEROS}).combine_chunks()
+    parquet.write_table(table, stream, compression="zstd")
+    content: bytes = stream.getvalue().to_pybytes()
+    return content.replace(_SEAL + _ZEROS, _SEAL + _digest(content))
+
+
+def _opened(content: bytes) -> pa.Table:
+    """And back. Raises ValueError where a bit of it is another."""
+    begin, _, end = content.partition(_SEAL)
+    if _digest(begin + _SEAL + _ZEROS + end[len(_ZEROS) :]) != end[: len(_ZEROS)]:
+        raise ValueError("another content")
+    return parquet.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # for so little they only cost time
+
+
+def _read(place: Path, recipe: str, log: str, configuration: str) -> LogTables:
+    """Raises ValueError, KeyError, TypeError or OSError where anything is not as it was written."""
+    table = _opened(place.read_bytes())
+    said = table.schema.metadata
+    if said[b"recipe"] != recipe.encode():
+        raise ValueError("another recipe")
+    names = [name for name in table.column_names if not name.startswith(_BESIDE)]
+    rows = _whose(table.select(names), log, configuration)
+    if b"sums" not in said:
+        return LogTables(log, rows)
+    content = place.with_suffix(".sums.parquet").read_bytes()
+    if _digest(content) != said[b"sums"]:
+        raise ValueError("other sums")
+    sums = _opened(content)
+    nodes = [(count, _total(of)) for count, of in json.loads(sums.schema.metadata[b"sums"])]
+    beside = table.select([name for name in table.column_names if name.startswith(_BESIDE)])
+    beside = beside.rename_columns([name.removeprefix(_BESIDE) for name in beside.column_names])
+    runs = _whose(sums.replace_schema_metadata(None), log, configuration).cast(RUNS)
+    beside = beside.replace_schema_metadata(None).cast(BESIDE)  # which calls what is in lists as it was called
+    return LogTables(log, rows, beside, runs, {configuration: nodes} if nodes else {})
+
+
+def _whose(table: pa.Table, *whose: str) -> pa.Table:
+    for k, (name, value) in enumerate(zip(_WHOSE, whose, strict=True)):
+        table = table.add_column(k, name, pa.repeat(pa.scalar(value, pa.string()), len(table)))
+    return table
+
+
+def _as_json(of: Total) -> dict[str, Any]:
+    arrays = {name: np.ascontiguousarray(getattr(of, name)).tobytes().hex() for name in _RECORDS}
+    return {f.name: getattr(of, f.name) for f in fields(Total)} | {"settings": asdict(of.settings)} | arrays
+
+
+def _total(said: dict[str, Any]) -> Total:
+    settings: dict[str, Any] = {n: _tuples(v) for n, v in said["settings"].items()}
+    arrays = {name: np.frombuffer(bytes.fromhex(said[name]), dtype=kind) for name, kind in _RECORDS.items()}
+    one = {name: arrays[name].reshape(()) for name in ("episodes", "runs")}
+    return Total(**said | {"settings": Settings(**settings)} | arrays | one)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -1,0 +1,130 @@
+"""One log of a study: read and made ready where its objects are needed, and else known from before."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from copem_replay.core.tracks import TRUTH, VALUES, Tracks
+from copem_replay.experiment.drive import of_log
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.checksum import sha256_of
+from copem_replay.io.containers.rosbag2_metadata import files_of
+from copem_replay.io.recording import Recording
+from copem_replay.io.survey import Survey, whole
+from copem_replay.io.together import Place, Together
+from copem_replay.io.truth_digest import truth_digest
+from copem_replay.pipeline.facts import Facts, scene_as_json, scene_of
+from copem_replay.pipeline.pieces import Pieces
+from copem_replay.pipeline.prepare import Replay, prepare
+from copem_replay.pipeline.recipe import canonical, fingerprint, sources
+
+_NOT_OF_A_SURVEY = ("logs", "show", "sweep")
+
+
+@dataclass
+class StudyLog:
+    """`experiment`: of the study, for which the log is made `ready`."""
+
+    recording: Recording
+    experiment: Experiment
+    pieces: Pieces | None = None
+    ready: Replay | None = None
+    _facts: tuple[Experiment, Facts] | None = None  # those that were asked for last
+
+    @property
+    def name(self) -> str:
+        """What the log is called."""
+        return self.recording.scene.log
+
+    def replay(self) -> Replay:
+        """The log made ready."""
+        if self.ready is None:
+            self.recording = whole(self.recording)
+            self.ready = prepare(self.recording, of_log(self.experiment, self.name))
+        return self.ready
+
+    @cached_property
+    def digests(self) -> Mapping[str, str]:
+        """SHA-256 of the content, and of the truth."""
+        if self.recording.survey is not None:
+            return {name: self.recording.survey.said[name] for name in ("sha256", "truth")}
+        return {
+            "sha256": sha256_of(self.recording.place),
+            "truth": truth_digest(self.recording.scene, self.recording.truth),
+        }
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What of the log is in the recipes of its pieces: by its name draws are addressed."""
+        together = self.recording.together
+        ahead_ns = [] if together is None else list(together.ahead_ns)
+        named = {"name": self.name, "sha256": self.digests["sha256"], "topic": self.recording.topic}
+        return named | {"ahead_ns": ahead_ns}
+
+    def facts(self, experiment: Experiment) -> Facts:
+        """What the results say of the log beside its rows, in an experiment; kept for the next time."""
+        if self._facts is None or self._facts[0] is not experiment:
+            self._facts = experiment, self._found(of_log(experiment, self.name))
+        return self._facts[1]
+
+    def _found(self, alone: Experiment) -> Facts:
+        if self.pieces is None:
+            return Facts.of(self.recording, self.replay(), alone)
+        about = survey_key(self.recording.place, alone)
+        said = self.pieces.known(about)
+        if said is not None and said["scene"]["log"] == self.name:
+            return Facts.read(said["facts"])
+        replay = self.replay()
+        found = Facts.of(self.recording, replay, alone)
+        self.pieces.keep(about, self._survey() | {"facts": found.as_json()})
+        return found
+
+    def _survey(self) -> dict[str, Any]:
+        one = self.recording
+        said = {"scene": scene_as_json(one.scene), "topic": one.topic, "notes": list(one.notes), "host": one.host_id}
+        return said | dict(self.digests)
+
+
+def survey_key(place: Place, experiment: Experiment) -> str:
+    """All that is known of a log depends on: its files as they are now, and the experiment, resolved for it."""
+    paths = place.paths if isinstance(place, Together) else (place,)
+    files = [file for path in paths for file in (files_of(path) if path.is_dir() else [path])]
+    stats = [(os.path.realpath(file), os.stat(file)) for file in files]
+    data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
+    return canonical(
+        {
+            "survey": 1,
+            "fingerprint": fingerprint(),
+            "own": sources(experiment),
+            "files": [(file, stat.st_size, stat.st_mtime_ns) for file, stat in stats],
+            "ahead_ns": place.ahead_ns if isinstance(place, Together) else (),
+            "experiment": data,
+        }
+    )
+
+
+def known_log(pieces: Pieces, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
+    """A recording as it is known from before, in an experiment that is resolved for it; None: it has to be read."""
+    said = pieces.known(survey_key(place, experiment))
+    if said is None:
+        return None
+    path, together = (place.paths[0], place) if isinstance(place, Together) else (place, None)
+    return Recording(
+        scene_of(said["scene"]), _nothing(), path, said["topic"], tuple(said["notes"]), said["host"],
+        together=together, survey=Survey(said, read),
+    )  # fmt: skip
+
+
+def _nothing() -> Tracks:
+    """Tracks of no object."""
+    none, values = np.empty(0, dtype=np.int64), np.empty((1, 0))
+    return Tracks(
+        (TRUTH,), np.zeros(1, dtype=np.int64), none, none, none, none, np.empty(0), none, values,
+        np.empty((1, 0), dtype=bool), **dict.fromkeys(VALUES, values),
+    )  # fmt: skip

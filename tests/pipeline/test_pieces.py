@@ -1,0 +1,191 @@
+"""Pieces: what was computed once is found again, and results with and without them are the same bytes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from copem_replay.core.errors import InputError, OutputError
+from copem_replay.experiment import validate
+from copem_replay.pipeline.pieces import ranges
+from tests.cli.test_api import cr
+from tests.helpers.experiments import changed, drive
+
+FLEET = "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}"
+EXACT = "measure: {onset: {kind: in_range, range_m: 60}, exact: true}"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name in "ab":
+        drive(tmp_path / f"{name}.mcap")
+    return tmp_path
+
+
+def study(*changes: str, runs: int = 130, gnn: bool = False) -> str:
+    text = changed(f"runs: {runs}", "logs: [a.mcap, b.mcap]", *changes)
+    return text.replace("measure:", "  gnn: {units: all, fusion: {kind: gnn}}\nmeasure:") if gnn else text
+
+
+def replayed(text: str, out: str, kept: str | None = "kept") -> tuple[dict[str, bytes], int, int]:
+    """Files of the results, and how many pieces were computed and found."""
+    Path("e.yaml").write_text(text)
+    result = cr.run("e.yaml", jobs=2, pieces=kept)
+    result.save(out, overwrite=True)
+    store = result.replayed.logs[0].pieces
+    counts = (0, 0) if store is None else (store.computed, store.found)
+    files = {path.name: path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
+    return {name: content for name, content in files.items() if not name.endswith(".rrd")}, *counts
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        study(gnn=True),
+        study(EXACT, "sweep: {latency_s: [0, 0.3]}"),
+        study(FLEET, runs=70),
+        study("measure: {onset: {kind: in_range, range_m: 60}, accuracy: false}"),
+    ],
+    ids=["fusions", "exact and swept", "fleet", "without accuracy"],
+)
+def test_the_same_bytes_computed_found_and_half_found(text: str, here: Path) -> None:
+    plain, _, _ = replayed(text, "plain", None)
+    first, computed, found = replayed(text, "first")
+    assert (found, first) == (0, plain)
+    again, more, found = replayed(text, "again")
+    assert (more, found, again) == (0, computed, plain)
+    for path in sorted(Path("kept/pieces").rglob("*[0-9a-f].parquet"))[::3]:
+        path.unlink()
+    half, more, found = replayed(text, "half")
+    assert more > 0
+    assert (more + found, half) == (computed, plain)
+
+
+def test_what_is_added_is_computed_and_nothing_else(here: Path) -> None:
+    """Of a log with one object: runs 0 to 64, 128, 256, …; two logs, three configurations."""
+    assert replayed(study(), "out")[1:] == (2 * 3 * 3, 0)
+    more, computed, found = replayed(study(gnn=True), "out")
+    assert (computed, found) == (2 * 3, 18)
+    assert more == replayed(study(gnn=True), "fresh", None)[0]
+    raised, computed, found = replayed(study(runs=300), "out")  # the piece that was cut, and one more
+    assert (computed, found) == (2 * 3 * 2, 2 * 3 * 2)
+    assert raised == replayed(study(runs=300), "fresh", None)[0]
+    assert replayed(study(runs=128), "out")[1:] == (0, 2 * 3 * 2)
+    assert replayed(study().replace("coPEM:", "renamed:"), "out")[1:] == (0, 18)
+    third = study("logs: [a.mcap, b.mcap, c.mcap]")
+    drive(here / "c.mcap")
+    assert replayed(third, "out")[1:] == (9, 18)
+    assert replayed(study("seed: 2"), "out")[1:] == (18, 0)
+    assert replayed(study("window_s: [0, 2.5]"), "out")[1:] == (18, 0)
+    assert replayed(study().replace("latency_s: 0.5", "latency_s: 0.4"), "out")[1:] == (6, 12)
+    drive(here / "b.mcap", host=None)
+    assert replayed(study("ego: '1'"), "out")[2] == 0
+
+
+def test_a_finished_study_is_resumed_without_reading_a_log(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty names of one recording, in two configurations."""
+    for k in range(30):
+        (here / f"name{k}.mcap").hardlink_to(here / "a.mcap")
+    text = study("logs: [name*.mcap]", "measure: {onset: {kind: in_range, range_m: 60}, accuracy: false}", runs=3)
+    first, computed, _ = replayed(text, "first")
+    assert computed == 30 * 3
+
+    def unread(*given: Any, **keys: Any) -> None:
+        raise AssertionError("a log was read")
+
+    monkeypatch.setattr(validate, "read", unread)
+    again, computed, found = replayed(text, "again")
+    assert (computed, found, again) == (0, 90, first)
+
+
+def test_a_log_that_is_shown_is_read_again_and_no_other(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = study("show: {run: worst, logs: [b]}", runs=3)
+    first, _, _ = replayed(text, "first")
+    names, read = [], validate.read
+    monkeypatch.setattr(validate, "read", lambda *a, **k: names.append(k["name"]) or read(*a, **k))
+    again, _, _ = replayed(text, "again")
+    assert names == ["b"]
+    assert again == first
+    assert "b.mcap" in again
+
+
+def test_what_is_damaged_is_computed_again(here: Path) -> None:
+    text = study(runs=5)
+    whole, _, _ = replayed(text, "whole")
+    rng, places = np.random.default_rng(1), sorted(Path("kept/pieces").rglob("*.parquet"))
+    for place in places[:2]:
+        before = place.read_bytes()
+        for at in [*rng.integers(0, len(before), 5).tolist(), None]:
+            content = bytearray(before)
+            if at is None:
+                content = content[: len(content) // 2]
+            else:
+                content[at] ^= 1 << int(rng.integers(8))
+            place.write_bytes(content)
+            found, again, _ = replayed(text, "out")
+            assert found == whole, (place, at)
+            assert again <= 1
+            place.write_bytes(before)
+    result = cr.run("e.yaml", pieces="kept")
+    assert result.replayed.logs[0].pieces.damaged == []  # type: ignore[union-attr]
+    places[0].write_bytes(b"no Parquet")
+    store = cr.run("e.yaml", pieces="kept").replayed.logs[0].pieces
+    assert store is not None
+    assert re.fullmatch(r"kept/pieces/../[0-9a-f.]+parquet: damaged, computed again \(.*\)", store.damaged[0])
+
+
+@pytest.mark.parametrize(
+    ("runs", "episodes", "expected"),
+    [
+        (10, 1, [0, 10]),
+        (200, 1, [0, 64, 128, 200]),
+        (1000, 1, [0, 64, 128, 256, 512, 1000]),
+        (1000, 2000, [0, 64, 128, 192, 256, 320, 384, 448, 512, 576, 640, 704, 768, 832, 896, 960, 1000]),
+        (5, 200_000, [0, 1, 2, 3, 4, 5]),
+        (3, 0, [0, 3]),
+    ],
+)
+def test_ranges_of_runs(runs: int, episodes: int, expected: list[int]) -> None:
+    found = list(ranges(runs, episodes))
+    assert [begin for begin, _ in found] + [runs] == expected
+    assert [end for _, end in found] == expected[1:]
+
+
+@pytest.mark.parametrize("episodes", [0, 1, 700, 3000, 130_000])
+def test_more_runs_have_the_same_ranges_but_the_last(episodes: int) -> None:
+    long = list(ranges(5000, episodes))
+    for runs in (1, 63, 64, 65, 300, 4999):
+        assert list(ranges(runs, episodes))[:-1] == long[: len(list(ranges(runs, episodes))) - 1]
+    for begin, end in long[:-1]:
+        assert (end - begin) & (end - begin - 1) == 0
+        assert begin % (end - begin) == 0
+
+
+def test_where_nothing_can_be_kept(here: Path) -> None:
+    Path("e.yaml").write_text(study())
+    with pytest.raises(InputError, match=r"^--pieces: expected a folder, found s3://here$"):
+        cr.run("e.yaml", pieces="s3://here")
+    with pytest.raises(OutputError, match=r"^--pieces: a.mcap: cannot be written: Not a directory$"):
+        cr.run("e.yaml", pieces="a.mcap")
+
+
+def test_a_long_log_in_stretches_has_the_pieces_of_each_configuration_alone(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stretches reach back as far as any configuration needs: pieces of one alone are those among others."""
+    from copem_replay.pipeline import chunking
+
+    monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 20)
+    text = study(runs=6, gnn=True)
+    plain, _, _ = replayed(text, "plain", None)
+    lines = text.splitlines()
+    for name in ("PEM", "coPEM", "gnn"):
+        alone = [line for line in lines if "{units" not in line or line.startswith(f"  {name}:")]
+        assert replayed("\n".join(alone), "alone")[1:] == (2, 0)
+    again, computed, found = replayed(text, "again")
+    assert (computed, found, again) == (2, 2 * 3, plain)
