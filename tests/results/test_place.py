@@ -19,6 +19,7 @@ import pytest
 from copem_replay.core import scratch
 from copem_replay.core.errors import OutputError
 from copem_replay.core.files import atomic_file
+from copem_replay.pipeline import gather
 from copem_replay.pipeline import run as runs
 from copem_replay.results import belongings, lock, place
 from tests.helpers.experiments import TEXT, changed, drive
@@ -165,7 +166,7 @@ class TestOneWriter:
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         with place.taken(here / "out/e", overwrite=False):
-            monkeypatch.setattr(runs, "outcomes", raises(errno.EIO))
+            monkeypatch.setattr(gather, "outcomes", raises(errno.EIO))
             ended = call("run", "e.yaml")
         assert ended.code == 2
         assert ended.lines == [

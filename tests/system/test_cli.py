@@ -20,7 +20,7 @@ import pytest
 from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
 from copem_replay.experiment.file import load, parse
-from copem_replay.pipeline import run
+from copem_replay.pipeline import gather
 from copem_replay.report.figures import load_results
 from copem_replay.results import place
 from copem_replay.results import write as results
@@ -386,7 +386,7 @@ class TestCheck:
         self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("copem_replay.pipeline.memory.free_bytes", lambda: 50_000)
-        monkeypatch.setattr(run, "outcomes", raising(OSError(5, "Input/output error")))
+        monkeypatch.setattr(gather, "outcomes", raising(OSError(5, "Input/output error")))
         said = "note: 4 runs of 3 rows each may take 6e-05 GB, and 5e-05 GB are free"
         assert call("check", "e.yaml").lines == [said]
         assert call("run", "e.yaml").lines == [said, "copem-replay: Input/output error"]
@@ -905,7 +905,7 @@ class TestTarget:
         self, here: Path, call: Call, out: str, said: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """Said before anything is replayed."""
-        monkeypatch.setattr(run, "outcomes", raising(AssertionError("replayed")))
+        monkeypatch.setattr(gather, "outcomes", raising(AssertionError("replayed")))
         (here / "loop").symlink_to("pool")
         (here / "pool").symlink_to("loop")
         before = sorted(os.listdir(here))
@@ -1029,7 +1029,7 @@ class TestFailure:
     def test_while_replaying(
         self, here: Path, call: Call, arguments: list[str], failure: Failure, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(run, "outcomes", raising(failure.error))
+        monkeypatch.setattr(gather, "outcomes", raising(failure.error))
         self.fails(here, call, arguments, failure)
 
     @pytest.mark.parametrize("failure", FAILURES, ids=[type(f.error).__name__ for f in FAILURES])
