@@ -30,6 +30,7 @@ from copem_replay.results.tables import (
     OPTIONAL,
     ROWS,
     VERDICTS,
+    file_of,
     is_rowless,
     read_arrow,
     read_csv,
@@ -162,9 +163,10 @@ class Results:
         place = self.folder / "detections.parquet"
         if is_rowless(place):
             raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
-        tables = {place.name: read_arrow(place, DETECTIONS | (VERDICTS if self.provenance.braking is not None else {}))}
-        there = {name: columns for name, columns in OPTIONAL.items() if (self.folder / name).is_file()}
-        tables |= {name: read_arrow(self.folder / name, columns) for name, columns in there.items()}
+        columns = DETECTIONS | (VERDICTS if self.provenance.braking is not None else {})
+        tables = {place.name: read_arrow(place, columns, self._files(place))}
+        there = {name: kinds for name, kinds in OPTIONAL.items() if (self.folder / name).is_file()}
+        tables |= {name: read_arrow(self.folder / name, kinds) for name, kinds in there.items()}
         check_still(self.folder, self.seen)
         return tables
 
@@ -210,8 +212,18 @@ class Results:
                 raise InputError(f"{self.folder}: configurations: expected some of {', '.join(known)}, found {name!r}")
         return tuple(dict.fromkeys(configurations)) if configurations else known
 
+    def _files(self, place: Path) -> list[Path]:
+        """Of a table that is a folder, in the order of the logs; none: it is a file."""
+        if not place.is_dir():
+            return []
+        return [path for log in self.provenance.logs if (path := file_of(place, log.name)).is_file()]
+
     def _frame(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
-        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else pd.read_parquet, columns)
+        def parquet(place: Path) -> pd.DataFrame:
+            files = self._files(place)
+            return pd.concat(map(pd.read_parquet, files), ignore_index=True) if files else pd.read_parquet(place)
+
+        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else parquet, columns)
         check_still(self.folder, self.seen)
         return table
 
@@ -233,7 +245,7 @@ def open_results(folder: Path | str, *more: str) -> Results:
 
 def _check_there(folder: Path, *names: str) -> None:
     for name in names:
-        if not (folder / name).is_file():
+        if not (folder / name).is_file() and not (name == "detections.parquet" and (folder / name).is_dir()):
             raise InputError(
                 f"{folder}: expected a results folder, found no {name} in it; `copem-replay run` writes one"
             )

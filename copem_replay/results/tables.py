@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import pandas as pd
 
@@ -13,6 +14,15 @@ from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+MANY_ROWS = 10_000_000
+"""A table with more rows than this is a folder of its name, with a file per log (chosen: half a GB in memory)."""
+
+
+def file_of(table: Path, log: str) -> Path:
+    """Where the rows of a log are, of a table that is a folder."""
+    return table / f"{quote(log, safe=' ')}.parquet"
+
 
 FORMAT = 2
 """Of results folders: raised when columns, files or their meaning change so that readers have to know."""
@@ -85,14 +95,16 @@ def is_rowless(path: Path) -> bool:
     """Whether a table is sound and has no row. Its columns then have no types either."""
     from pyarrow import parquet
 
+    if path.is_dir():
+        return False
     try:
         return bool(parquet.read_metadata(path).num_rows == 0)
     except (OSError, ValueError):  # the reader of the table reports it
         return False
 
 
-def read_arrow(path: Path, columns: Mapping[str, str]) -> pa.Table:
-    """These columns of a table, text as `string`, and those that it may have.
+def read_arrow(path: Path, columns: Mapping[str, str], files: Sequence[Path] = ()) -> pa.Table:
+    """These columns of a table, text as `string`, and those that it may have. `files`: of one that is a folder.
 
     Raises InputError where one is missing or of another kind.
     """
@@ -100,11 +112,11 @@ def read_arrow(path: Path, columns: Mapping[str, str]) -> pa.Table:
     from pyarrow import parquet
 
     try:
-        there = parquet.read_schema(path).names
+        there = parquet.read_schema(files[0] if files else path).names
         if missing := [name for name in columns if name not in there]:
             raise InputError(f"{path}: expected the column {missing[0]}, found none; {AGAIN}")
         columns = dict(columns) | {n: kind for n, kind in MAY_HAVE.get(path.name, {}).items() if n in there}
-        table = parquet.read_table(path, columns=list(columns))
+        table = parquet.read_table(list(files) or path, columns=list(columns))
     except (OSError, ValueError) as error:  # what Arrow raises derives from these
         why = " ".join(str(error).split())
         raise InputError(f"{path}: expected a table that can be read, found damage: {why}; {AGAIN}") from None

@@ -28,10 +28,10 @@ from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
 from copem_replay.pipeline.sweep import resolved
+from copem_replay.results import tables
 from copem_replay.results.belongings import MARK
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
-from copem_replay.results.tables import FORMAT
 
 _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
@@ -90,7 +90,8 @@ def _files(
     experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
 ) -> list[str]:
     """What is going to be in the folder, by names relative to it."""
-    files = [EXPERIMENT, MARK, "detections.parquet", "tally.parquet", "summary.csv", "logs.csv"]
+    files = [EXPERIMENT, MARK, "summary.csv", "logs.csv"]
+    files += _of_logs("detections.parquet", result.table) + _of_logs("tally.parquet", result.tally)
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
     if result.accuracy is not None:
         files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
@@ -99,6 +100,13 @@ def _files(
             stem, shown_count = _target(shown, log, recordings), len(experiment.shown())
             files += [name for exporter in exporters for name in exporter.files(stem, shown_count)]
     return sorted(files)
+
+
+def _of_logs(name: str, table: pd.DataFrame) -> list[str]:
+    """The file of a table, or those of its logs where it has many rows."""
+    if len(table) <= tables.MANY_ROWS:
+        return [name]
+    return [str(tables.file_of(Path(name), str(log))) for log in table["log"].unique()]
 
 
 def _target(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
@@ -115,8 +123,13 @@ def _fill(
     for of in _recorded_latencies(data):
         of["file"] = os.path.relpath(of["file"], place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
-    write_parquet(result.table, scratch / "detections.parquet")
-    write_parquet(result.tally, scratch / "tally.parquet")
+    for table, name in ((result.table, "detections.parquet"), (result.tally, "tally.parquet")):
+        if len(table) <= tables.MANY_ROWS:
+            write_parquet(table, scratch / name)
+        else:
+            (scratch / name).mkdir()
+            for log, part in table.groupby("log", sort=False):
+                write_parquet(part, tables.file_of(scratch / name, str(log)))
     write_csv(result.summary, scratch / "summary.csv")
     if result.exact is not None:
         write_parquet(result.exact, scratch / "exact.parquet")
@@ -217,7 +230,7 @@ def provenance_of(
     """What made these results: versions, logs, seed, metric parameters; no clock, no host."""
     shown = {log: shown_runs(experiment, result, log) for log in shown_logs(experiment, result)}
     return {
-        "format": FORMAT,
+        "format": tables.FORMAT,
         "copem_replay": version("copem-replay"),
         "python": platform.python_version(),
         "libraries": {name: version(name) for name in _LIBRARIES},
@@ -260,10 +273,10 @@ def write_parquet(table: Any, path: Path) -> None:
             writer.write_table(arrow.slice(k, ROWS_A_GROUP).combine_chunks(), row_group_size=ROWS_A_GROUP)
 
 
-def _write_accuracy(tables: AccuracyTables, scratch: Path) -> None:
+def _write_accuracy(accuracy: AccuracyTables, scratch: Path) -> None:
     for name in _ACCURACY:
-        write_parquet(getattr(tables, name), scratch / f"{name}.parquet")
-    write_csv(tables.bands, scratch / "bands.csv")
+        write_parquet(getattr(accuracy, name), scratch / f"{name}.parquet")
+    write_csv(accuracy.bands, scratch / "bands.csv")
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:

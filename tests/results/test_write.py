@@ -15,6 +15,7 @@ import pytest
 from mcap.reader import make_reader
 from pyarrow import parquet
 
+import copem_replay as cr
 from copem_replay.core.time_chunk import WHOLE
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
@@ -23,10 +24,12 @@ from copem_replay.pipeline import blocks as blocks_module
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
+from copem_replay.results import tables as result_tables
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS
 from tests.helpers import scenes
+from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
 from tests.helpers.scenes import experiment
 
@@ -372,3 +375,28 @@ def test_what_is_shown_is_written_by_the_exporters_that_are_passed(two_logs: lis
     assert shown <= set(json.loads((tmp_path / "own/provenance.json").read_text())["files"])
     write_results(tmp_path / "none", chosen, recordings, result, exporters=[])
     assert not (tmp_path / "none" / "replay").exists()
+
+
+def test_a_table_of_many_rows_is_a_folder_that_reads_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file per log, in the experiment's order; what reads results reads either."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("b", "a"):
+        drive(tmp_path / f"{name}.mcap")
+    said = changed("logs: [{file: b.mcap, name: two/b %}, {file: a.mcap, name: a}]")
+    (tmp_path / "e.yaml").write_text(said)
+    cr.run("e.yaml").save("whole")
+    monkeypatch.setattr(result_tables, "MANY_ROWS", 10)
+    cr.run("e.yaml").save("many")
+    names = ["a.parquet", "two%2Fb %25.parquet"]
+    assert sorted(path.name for path in Path("many/detections.parquet").iterdir()) == names
+    whole, many = cr.load_results("whole"), cr.load_results("many")
+    pd.testing.assert_frame_equal(whole.table, many.table)
+    in_any_order = pd.read_parquet("many/detections.parquet").sort_values(["log", "configuration", "run"])
+    assert len(in_any_order) == len(whole.table)
+    first, second = (cr.compare(folder, baseline="PEM").table for folder in (whole, many))
+    pd.testing.assert_frame_equal(first, second)
+    listed = json.loads(Path("many/provenance.json").read_text())["files"]
+    assert [name for name in listed if name.startswith("detections")] == [f"detections.parquet/{n}" for n in names]
+    monkeypatch.setattr(result_tables, "MANY_ROWS", 1000)
+    cr.run("e.yaml").save("many", overwrite=True)  # a file in the place of the folder
+    assert Path("many/detections.parquet").is_file()
