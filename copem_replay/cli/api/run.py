@@ -140,7 +140,7 @@ def run(
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
     paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
     depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder in which what was
-    computed is kept, and found by the next run (docs/scale.md).
+    computed is kept, and found by the next run (docs/guide/scale.md).
 
     Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
     both together, times without a closed form, runs that no memory holds.
