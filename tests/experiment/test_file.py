@@ -489,8 +489,8 @@ CASES = [
     (MEASURE, "conflict: {horizon_s: 0}", ".conflict.horizon_s: expected more than 0, found 0"),
     (MEASURE, "exact: yes", ".exact: expected true or false, found 'yes'"),
     (SWEEP, "{}",
-     ": expected values of latency_s, rate_hz, units, penetration_rate, correlation_s or ghosts_in_list, such as "
-     "`latency_s: [0, 0.5, 1]`"),
+     ": expected values of latency_s, rate_hz, units, penetration_rate, correlation_s, ghosts_in_list, loss or "
+     "burst_s, such as `latency_s: [0, 0.5, 1]`"),
     (SWEEP, "{latency_s: 1}", ".latency_s: expected a list, found 1"),
     (SWEEP, "{units: [1.5, -1]}",
      ".units[0]: expected a whole number, found 1.5",

@@ -217,7 +217,16 @@ class TestPoints:
         assert [(point.sweep, point.value) for point in points(wanted)] == [
             ("latency_s", 1), ("latency_s", 0), ("rate_hz", 20), ("rate_hz", 10), ("units", 3), ("units", 0),
         ]  # fmt: skip
-        assert KINDS == ("latency_s", "rate_hz", "units", "penetration_rate", "correlation_s", "ghosts_in_list")
+        assert KINDS == (
+            "latency_s",
+            "rate_hz",
+            "units",
+            "penetration_rate",
+            "correlation_s",
+            "ghosts_in_list",
+            "loss",
+            "burst_s",
+        )
 
     @pytest.mark.parametrize(
         "sweep",
@@ -597,8 +606,8 @@ class TestCheck:
             (
                 ["sweep: {}"],
                 [
-                    "19: sweep: expected values of latency_s, rate_hz, units, penetration_rate, correlation_s or "
-                    "ghosts_in_list, such as `latency_s: [0, 0.5, 1]`"
+                    "19: sweep: expected values of latency_s, rate_hz, units, penetration_rate, correlation_s, "
+                    "ghosts_in_list, loss or burst_s, such as `latency_s: [0, 0.5, 1]`"
                 ],
             ),
             (
@@ -608,8 +617,8 @@ class TestCheck:
             (
                 ["sweep: {configurations: [PEM]}"],
                 [
-                    "19: sweep: expected values of latency_s, rate_hz, units, penetration_rate, correlation_s or "
-                    "ghosts_in_list, such as `latency_s: [0, 0.5, 1]`"
+                    "19: sweep: expected values of latency_s, rate_hz, units, penetration_rate, correlation_s, "
+                    "ghosts_in_list, loss or burst_s, such as `latency_s: [0, 0.5, 1]`"
                 ],
             ),
             (
