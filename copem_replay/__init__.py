@@ -19,6 +19,7 @@ from copem_replay.core.moved import put_up_signposts as _put_up_signposts
 
 if TYPE_CHECKING:
     from copem_replay.cli.api import plot
+    from copem_replay.cli.api.fit import FittedPem, fit
     from copem_replay.cli.api.recordings import (
         draft_experiment,
         inspect_recording,
@@ -76,6 +77,7 @@ __all__ = [
     "Errors",
     "Experiment",
     "ExperimentError",
+    "FittedPem",
     "FusedTracks",
     "Inbox",
     "InputError",
@@ -110,6 +112,7 @@ __all__ = [
     "cumulative_incidence",
     "draft_experiment",
     "entries_of",
+    "fit",
     "fused_tracks",
     "gospa",
     "inspect_recording",
@@ -128,6 +131,7 @@ __all__ = [
 
 _PLACES = {
     "cli.api": "plot",
+    "cli.api.fit": "FittedPem fit",
     "cli.api.recordings": "draft_experiment inspect_recording read_lists read_recording read_recordings",
     "cli.api.results": "compare load_results view write_report",
     "cli.api.run": "StudyResult fused_tracks observations run",

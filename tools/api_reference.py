@@ -32,6 +32,7 @@ What is not on this page is private and may change in any release.
 GROUPS = {
     "Experiments and recordings": "load_experiment read_recordings read_recording inspect_recording draft_experiment",
     "Runs": "run StudyResult observations fused_tracks FusedTracks read_lists",
+    "Fits": "fit FittedPem",
     "Results": "load_results Results compare Comparison write_report view",
     "Figures": "plot",
     "Keys of an experiment": "Experiment Unit Configuration Measure Onset",

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+import bench_fit
 import bench_fusion
 import bench_links
 import bench_long
@@ -343,7 +344,14 @@ def _cpu_seconds(arguments: list[str]) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-BENCHES = (pieces, visibility, memory, paper, reading, writing, commands, reports, fusion, peers, links, crowd, long)
+def fit() -> Iterator[dict[str, object]]:
+    """Fitting a perception error model to 10⁵ rows; see bench_fit.py."""
+    yield from bench_fit.detection()
+
+
+BENCHES = (
+    pieces, visibility, memory, fit, paper, reading, writing, commands, reports, fusion, peers, links, crowd, long,
+)  # fmt: skip
 
 if __name__ == "__main__":
     main(sys.argv[1:])

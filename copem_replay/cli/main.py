@@ -1,7 +1,7 @@
 """The command line: the commands of this folder, and one place where errors become exit codes.
 
-0 done · 1 done, but a log was skipped · 2 the input was wrong: plain lines on stderr · 70 internal error: traceback ·
-130 interrupted.
+0 done · 1 done, but a log was skipped, or a fitted model is unlike what was recorded · 2 the input was wrong: plain
+lines on stderr · 70 internal error: traceback · 130 interrupted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ try:  # before `main` is there to catch it
 
     import typer
 
-    from copem_replay.cli import convert, inspect, results, run
+    from copem_replay.cli import convert, fit, inspect, results, run
     from copem_replay.cli.terminal import complain
     from copem_replay.core.compiled import cache_note
     from copem_replay.core.errors import CopemError, InputError
@@ -57,6 +57,7 @@ for command in (
     inspect.init,
     inspect.check,
     run.run,
+    fit.fit,
     results.compare,
     results.plot,
     results.report,

@@ -31,8 +31,8 @@ def bilinear(
 ) -> Float:
     """(P,) the table at x (P,) on its first axis and y (P,) on its second."""
     table = np.array(rows)
-    i, a = _place(np.array(first), x)
-    j, b = _place(np.array(second), y)
+    i, a = place_on(np.array(first), x)
+    j, b = place_on(np.array(second), y)
     i1, j1 = np.minimum(i + 1, table.shape[0] - 1), np.minimum(j + 1, table.shape[1] - 1)
     low = table[i, j] * (1 - b) + table[i, j1] * b
     high = table[i1, j] * (1 - b) + table[i1, j1] * b
@@ -40,7 +40,7 @@ def bilinear(
     return result
 
 
-def _place(axis: Float, value: Float) -> tuple[Int, Float]:
+def place_on(axis: Float, value: Float) -> tuple[Int, Float]:
     """Cell (P,) and place within it (P,), 0 … 1, of values on an ascending axis; the ends hold beyond them."""
     if len(axis) == 1:
         return np.zeros(len(value), dtype=int), np.zeros(len(value))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import warnings
@@ -182,3 +183,60 @@ def _quoted(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {_quoted(name): _quoted(inner) for name, inner in value.items()}
     return [_quoted(inner) for inner in value] if isinstance(value, list) else value
+
+
+@dataclass(frozen=True)
+class Noted:
+    """A value with what is said of it behind, on its line."""
+
+    value: Any
+    words: str
+
+
+def commented(data: Mapping[str, Any]) -> str:
+    """Plain data in which values may be `Noted`, as YAML 1.2 text: with a line of its own for each that is."""
+    return "".join(f"{line}\n" for line in _block(data))
+
+
+def _block(value: Any) -> list[str]:
+    """The lines of a value that holds more than one line."""
+    lines: list[str] = []
+    items = value.items() if isinstance(value, Mapping) else ((None, item) for item in value)
+    for key, item in items:
+        name = "-" if key is None else f"{_flow(key)}:"
+        if isinstance(item, Noted):
+            lines += [f"{name} {_flow(item.value)}  # {' '.join(item.words.split())}"]
+        elif not _noted(item):
+            lines += [f"{name} {_flow(item)}"]
+        elif key is None:
+            first, *rest = _block(item)
+            lines += [f"- {first}", *(f"  {line}" for line in rest)]
+        else:
+            lines += [name, *(f"  {line}" for line in _block(item))]
+    return lines
+
+
+def _noted(value: Any) -> bool:
+    """Whether anything in a value is."""
+    if isinstance(value, Mapping):
+        return any(map(_noted, value.values()))
+    return isinstance(value, Noted) or (isinstance(value, list | tuple) and any(map(_noted, value)))
+
+
+def _flow(value: Any) -> str:
+    """Plain data on one line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_flow(key)}: {_flow(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_flow, value))}]"
+    plain = isinstance(value, str) and _PLAIN.fullmatch(value) and isinstance(_core(value), str)
+    return str(value) if plain else json.dumps(value, ensure_ascii=False)
+
+
+def without_notes(value: Any) -> Any:
+    """The same as plain data."""
+    if isinstance(value, Noted):
+        return value.value
+    if isinstance(value, Mapping):
+        return {key: without_notes(inner) for key, inner in value.items()}
+    return [without_notes(inner) for inner in value] if isinstance(value, list | tuple) else value

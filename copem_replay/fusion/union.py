@@ -13,11 +13,15 @@ from copem_replay.core.object_list import Entries, Inputs, ObjectLists, joined, 
 from copem_replay.core.tracks import Bool, Int
 from copem_replay.fusion.base import ListFusion
 
+_APART, _LARGEST = np.int64(-7046029254386353131), np.int64(2**63 - 1)
+"""Numbers of units times the first lie far apart among those of 63 bits."""
+
 
 class Union(ListFusion):
     """All entries of every unit's newest list side by side, as they are; those claimed less likely than
     `min_existence` are left out. No source: it is what cooperative perception is before any fusion. It assumes
     nothing, and so an object listed by n units is there n times, n − 1 times as a duplicate, and every ghost stays.
+    Tracks of different units are different ones; those of the first unit keep their ids.
     """
 
     kind: Literal["union"] = "union"
@@ -33,9 +37,20 @@ class Union(ListFusion):
             start, rows = side_by_side(bounds - bounds[0], inputs.newest, entries["existence"] >= self.min_existence)
             runs.append((start, taken(entries, rows)))
         fused = run_after_run(runs, len(inputs.issue_s))
-        # Two units' numbers of tracks have nothing to do with each other.
-        fused.entries["track_id"] = -1
+        fused.entries["track_id"] = _track_ids(fused)
         return fused
+
+
+def _track_ids(lists: ObjectLists) -> Int:
+    """(N,) the ids that units keep, of each unit others: the first's as they are. −1 where a list has one twice."""
+    ids, unit_ix = lists.entries["track_id"], lists.entries["unit_ix"]
+    told: Int = np.where(ids < 0, -1, ids ^ (unit_ix * _APART & _LARGEST))
+    starts = np.append(lists.start[:, :-1].ravel(), lists.start[-1:, -1])
+    list_ix = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    order = np.lexsort((told, list_ix))
+    again = (np.diff(told[order]) == 0) & (np.diff(list_ix[order]) == 0)
+    told[order[1:][again]] = told[order[:-1][again]] = -1
+    return told
 
 
 def run_after_run(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectLists:

@@ -60,6 +60,13 @@ class RecordedUnits:
         )
 
 
+def as_recorded(recording: Recording, topic: str) -> RecordedLists:
+    """The lists on a topic with what their messages say, and nothing else. Raises RecordingError."""
+    scene, window = recording.scene, recording.window
+    found = read_listed(recording.place, topic, scene, recording.around, window)
+    return found or read_recorded(recording.place, topic, scene, window)
+
+
 def recorded_unit(
     recording: Recording,
     name: str,
@@ -75,12 +82,13 @@ def recorded_unit(
     `called`: what it is in notes. `held`: whether what is odd about it is told by the truth, too.
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
-    path, scene, window = recording.path, recording.scene, recording.window
-    found = read_listed(recording.place, asked.topic, scene, recording.around, window)
-    found = found or read_recorded(recording.place, asked.topic, scene, window)
+    path, scene = recording.path, recording.scene
+    found = as_recorded(recording, asked.topic)
     tracks = found.tracks
     if not len(tracks.stamp_ns):
-        raise RecordingError(f"holds no list{' in the window' if window else ''}", path=path, topic=asked.topic)
+        raise RecordingError(
+            f"holds no list{' in the window' if recording.window else ''}", path=path, topic=asked.topic
+        )
     unsaid = ~found.spread_said
     if unsaid.any() and asked.covariance_m2 is None:
         raise RecordingError(
@@ -134,12 +142,15 @@ def beside_truth(
     yield from odd_about(found, told.row_object_ix, scene)
 
 
-def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float) -> Tracks:
+def with_truth_ids(
+    found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m: float, max_gap_s: float, confused: float = 0.0
+) -> Tracks:
     """The unit's tracks with truth ids: list by list the optimal assignment by distance, classes agreeing, gated.
 
     To leave a pair alone costs as much as the gate, so that no exact pair is given up for another one. Which entry is
     the ego's own body is settled before, by the ego alone (the nearest whose centre is in its box): it is left out of
-    what fusions see, and what they see must not depend on where others truly are.
+    what fusions see, and what they see must not depend on where others truly are. `confused`: a pair whose classes do
+    not agree counts so much as one whose do; 0: it is none.
     """
     tracks = found.tracks
     stamps, back = np.unique(tracks.stamp_ns, return_inverse=True)
@@ -156,8 +167,8 @@ def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m:
         away_m = np.hypot(
             tracks.x_m[0, rows, None] - world.x_m[0, there], tracks.y_m[0, rows, None] - world.y_m[0, there]
         )
-        allowed = AGREE[likely[rows][:, None], scene.object_class[world.row_object_ix[there]]]
-        allowed &= away_m <= gate_m + 1e-9
+        alike = AGREE[likely[rows][:, None], scene.object_class[world.row_object_ix[there]]]
+        allowed = (away_m <= gate_m + 1e-9) & (alike | (confused > 0))
         for ego in np.flatnonzero(world.row_object_ix[there] == scene.ego_ix):
             body_m = np.where(allowed[:, ego] & _inside(tracks, rows, world, there[ego]), away_m[:, ego], np.inf)
             if np.isfinite(body_m.min()):
@@ -165,7 +176,8 @@ def with_truth_ids(found: RecordedLists, scene: Scene, truth: Tracks, *, gate_m:
                 allowed[body_m.argmin()] = False
             allowed[:, ego] = False
         partner = np.full(len(rows), -1)
-        assign(np.where(allowed, away_m - (gate_m + 2e-9), np.inf), partner)
+        worth = (away_m - (gate_m + 2e-9)) * np.where(alike, 1.0, confused)
+        assign(np.where(allowed, worth, np.inf), partner)
         object_ix[rows[partner >= 0]] = world.row_object_ix[there[partner[partner >= 0]]]
     return replace(tracks, object_ix=object_ix)
 

@@ -81,6 +81,56 @@ def log_sequence(listed: Float, held: Bool, gap_s: Float, share: Float, tau_s: f
     return out
 
 
+@dataclass(frozen=True)
+class Sequences:
+    """What several series of lists show, one after the other: `start (N + 1,)` where each begins, lists (P,).
+
+    In each series in order of capture: `listed` with which probability, `held` the object or not, `gap_s` since the
+    list before. `edges`: 0, 1 and the different p of each series, which begin at `edge_start (N + 1,)`.
+    """
+
+    start: Int
+    listed: Float
+    held: Bool
+    gap_s: Float
+    edges: Float
+    edge_start: Int
+
+    @classmethod
+    def of(cls, start: Int, listed: Float, held: Bool, captured_s: Float) -> Sequences:
+        """Of lists captured at instants, series by series."""
+        number = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        ends = np.repeat(np.arange(len(start) - 1), 2)
+        edges = np.concatenate([listed, np.tile([0.0, 1.0], len(start) - 1)])
+        number = np.concatenate([number, ends])
+        order = np.lexsort((edges, number))
+        number, edges = number[order], edges[order]
+        new = np.r_[True, (np.diff(number) > 0) | (np.diff(edges) > 0)]
+        gap_s = np.diff(captured_s, prepend=captured_s[:1])
+        gap_s[start[:-1]] = 0.0
+        bounds = np.searchsorted(number[new], np.arange(len(start)))
+        return cls(start, listed, np.ascontiguousarray(held), gap_s, edges[new], bounds)
+
+    def log_probability(self, share: float, tau_s: float) -> Float:
+        """(P,) as `log_sequence` of each series."""
+        out = np.zeros(len(self.listed))
+        _filter_each(
+            self.start, self.listed, self.held, -self.gap_s / tau_s, np.full(len(out), share), self.edge_start,
+            self.edges, out,
+        )  # fmt: skip
+        return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _filter_each(
+    start: Int, listed: Float, held: Bool, log_same: Float, share: Float, edge_start: Int, edges: Float, out: Float
+) -> None:
+    for n in range(len(start) - 1):
+        a, b = start[n], start[n + 1]
+        cells = edges[edge_start[n] : edge_start[n + 1]]
+        _filter(listed[a:b], held[a:b], log_same[a:b], share[a:b], cells, out[a:b])
+
+
 @nb.njit(cache=True, nogil=True)
 def _filter(listed: Float, held: Bool, log_same: Float, share: Float, edges: Float, out: Float) -> None:
     """Fill `out (P,)`; `edges`: between which the density of U is constant, 0 … 1; `log_same`: ln φ of each list.
@@ -91,22 +141,26 @@ def _filter(listed: Float, held: Bool, log_same: Float, share: Float, edges: Flo
     mass = width.copy()
     for i in range(len(listed)):
         p, s = listed[i], share[i]
-        renewed = -np.expm1(log_same[i])
-        below = 0.0  # mass of U below p, and above it: each by itself, as either may be tiny
-        above = 0.0
+        same, renewed = np.exp(log_same[i]), -np.expm1(log_same[i])
         for j in range(len(mass)):
-            mass[j] = np.exp(log_same[i]) * mass[j] + renewed * width[j]
-            if edges[j] < p:
-                below += mass[j]
-            else:
-                above += mass[j]
+            mass[j] = same * mass[j] + renewed * width[j]
+        first = np.searchsorted(edges, p)  # the first cell above p
+        below = 0.0  # mass of U below p, and above it: each by itself, as either may be tiny
+        for j in range(first):
+            below += mass[j]
+        above = 0.0
+        for j in range(first, len(mass)):
+            above += mass[j]
         hit, miss = (1 - s) * p + s * below, (1 - s) * (1 - p) + s * above
         chance, other = (hit, miss) if held[i] else (miss, hit)
         if chance <= 0:
             out[i] = -np.inf
             return
         out[i] = np.log1p(-other) if other < 0.5 else np.log(chance)
-        for j in range(len(mass)):
-            fits = (edges[j] < p) == held[i]
-            by_fresh = (1 - s) * (p if held[i] else 1 - p)
-            mass[j] *= (by_fresh + (s if fits else 0.0)) / chance
+        by_fresh = (1 - s) * (p if held[i] else 1 - p)
+        by_both = (by_fresh + s) / chance
+        by_fresh /= chance
+        for j in range(first):
+            mass[j] *= by_both if held[i] else by_fresh
+        for j in range(first, len(mass)):
+            mass[j] *= by_fresh if held[i] else by_both

@@ -145,7 +145,7 @@ def observations(
         seen = partial(visible_shares, static=placed.static, observers=watching, model=experiment.visibility)
         shares = seen(world) if kept is None else kept.of(names[0], world, (from_s, cut_s or from_s, until_s), seen)
         for k, name in enumerate(names):
-            pieces[name] = _from_unit(world, places[k], int(carriers[k]), shares[k])
+            pieces[name] = from_unit(world, places[k], int(carriers[k]), shares[k])
     ordered = [pieces[name] for name in experiment.modelled]
     tracks = joined(tuple(experiment.modelled), [piece[0] for piece in ordered])
     view = ViewGeometry(
@@ -180,8 +180,8 @@ def _world(scene: Scene, truth: Tracks, stamps: Int, max_gap_s: float, from_s: f
     return world.captured_between(from_s, until_s)
 
 
-def _from_unit(world: Tracks, at: UnitPoses, carrier_ix: int, share: Float) -> tuple[Tracks, ViewGeometry]:
-    """The observation rows of one unit: all but its carrier, at the lists it exists for."""
+def from_unit(world: Tracks, at: UnitPoses, carrier_ix: int, share: Float) -> tuple[Tracks, ViewGeometry]:
+    """The rows of one unit, all but its carrier, at the lists it exists for, and their view but for the class."""
     keep = at.present[world.frame_ix] & (world.row_object_ix != carrier_ix)
     frames = np.flatnonzero(at.present)
     frame_number = np.cumsum(at.present) - 1

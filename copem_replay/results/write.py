@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -20,8 +19,7 @@ from copem_replay.core.csv_names import for_spreadsheets
 from copem_replay.core.errors import OutputError
 from copem_replay.core.yaml import dump
 from copem_replay.experiment.drive import of_log
-from copem_replay.experiment.file import at_place
-from copem_replay.experiment.schema import Experiment, LogSettings
+from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import place_of
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
@@ -30,15 +28,10 @@ from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, s
 from copem_replay.pipeline.sweep import resolved
 from copem_replay.results import tables
 from copem_replay.results.belongings import MARK
+from copem_replay.results.contents import log_entries, versions, write_parquet
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
 
-_LIBRARIES = (
-    "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
-    "scipy", "shapely",
-)  # fmt: skip
-ROWS_A_GROUP = 1 << 20
-"""Rows of a row group of Parquet, at most (that is Arrow's)."""
 _ACCURACY = ("accuracy", "instants", "lists", "thresholds")
 
 
@@ -119,7 +112,7 @@ def _fill(
 ) -> list[str]:
     """Write all files but the provenance. Returns notes for the user."""
     data, scratch = resolved(experiment).as_written(), place.new
-    data["logs"] = _entries(experiment.logs, recordings, place.folder)
+    data["logs"] = log_entries(experiment.logs, recordings, place.folder)
     for of in _recorded_latencies(data):
         of["file"] = os.path.relpath(of["file"], place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
@@ -179,19 +172,6 @@ def _logs(folder: Path, result: Result, skipped: Sequence[tuple[Path, str]]) -> 
     return pd.DataFrame(rows, columns=list(columns)).astype(columns)
 
 
-def _entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
-    """`logs` as the folder has it: a path relative to it each, with the log's settings where it has some."""
-
-    def called(path: Path) -> str:
-        return os.path.relpath(place_of(path), folder)
-
-    settings = [entry for entry in logs if isinstance(entry, LogSettings)]
-    if len(settings) < len(recordings):
-        return [called(recording.path) for recording in recordings]
-    moved = (at_place(one, r.place, called) for one, r in zip(settings, recordings, strict=True))
-    return [one.model_dump(mode="json", by_alias=True) for one in moved]
-
-
 def _run_to_export(
     log: str, shown: ShownRun, experiment: Experiment, recordings: Sequence[Recording], result: Result
 ) -> RunToExport:
@@ -231,9 +211,7 @@ def provenance_of(
     shown = {log: shown_runs(experiment, result, log) for log in shown_logs(experiment, result)}
     return {
         "format": tables.FORMAT,
-        "copem_replay": version("copem-replay"),
-        "python": platform.python_version(),
-        "libraries": {name: version(name) for name in _LIBRARIES},
+        **versions(),
         "seed": experiment.seed,
         "runs": experiment.runs,
         "logs": [
@@ -258,19 +236,6 @@ def provenance_of(
 def _utf8(name: str) -> str:
     """A file's name as text that can be written: bytes that are not UTF-8 escaped."""
     return name.encode(errors="backslashreplace").decode()
-
-
-def write_parquet(table: Any, path: Path) -> None:
-    """A table, of pandas or of Arrow, as Parquet: NaN as null, text as `string` whatever pandas keeps it in."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
-    fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
-    arrow = arrow.cast(pa.schema(fields, arrow.schema.metadata))
-    with parquet.ParquetWriter(path, arrow.schema, compression="zstd") as writer:
-        for k in range(0, max(len(arrow), 1), ROWS_A_GROUP):  # of one piece each, however the table was put together
-            writer.write_table(arrow.slice(k, ROWS_A_GROUP).combine_chunks(), row_group_size=ROWS_A_GROUP)
 
 
 def _write_accuracy(accuracy: AccuracyTables, scratch: Path) -> None:

@@ -17,9 +17,20 @@ def test_entries_of_all_newest_lists_stand_side_by_side_as_they_are():
     yours = entry(1.0, cov=(4.0, 1.0, 2.0), track_id=7)
     fused = Union().fuse(inputs_of([[mine, yours]], ["a", "b"], [0.1, 0.2], [0.3, 0.3]))
     expected = joined(mine, yours)
-    expected["captured_s"], expected["unit_ix"], expected["track_id"] = [0.1, 0.1, 0.2], [0, 0, 1], -1
+    expected["captured_s"], expected["unit_ix"] = [0.1, 0.1, 0.2], [0, 0, 1]
+    expected["track_id"] = [7, 8, 7 ^ (2**63 - 7046029254386353131)]  # the two 7 have nothing to do with each other
     assert fused.start.tolist() == [[0, 3]]
     assert in_any_order(fused.entries) == in_any_order(expected)
+
+
+def test_an_id_that_a_list_has_twice_says_nothing():
+    twice = joined(entry(1.0, track_id=7), entry(2.0, track_id=8), entry(3.0, track_id=7))
+    lists = [twice, entry(4.0, track_id=7)]
+    fused = Union().fuse(inputs_of([lists], ["a", "a"], [0.0, 0.1], [0.0, 0.1]))
+    assert dict(zip(fused.of(0, 0)["x_m"].tolist(), fused.of(0, 0)["track_id"].tolist(), strict=True)) == {
+        1.0: -1, 2.0: 8, 3.0: -1,
+    }  # fmt: skip
+    assert fused.of(0, 1)["track_id"].tolist() == [7]
 
 
 def test_what_was_reported_stays_as_it_was():

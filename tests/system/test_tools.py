@@ -24,6 +24,7 @@ DATA = ROOT.parent / "shared" / "data"
 sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
+import bench_fit  # noqa: E402
 import bench_fusion  # noqa: E402
 import bench_long  # noqa: E402
 import bench_memory  # noqa: E402
@@ -51,6 +52,14 @@ def test_bench_of_memory_remembers_all_that_the_crossing_draws(monkeypatch: pyte
     lasting = bench_memory.remembering(plain)
     assert all(pem.memory.keys() == {"detection", *(pem.asked() or ())} for pem in lasting.pems.values())
     assert lasting.configurations == plain.configurations
+
+
+def test_bench_of_fitting_finds_what_it_put_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """60 of its drives: all rungs, and the share .6 of what lasts."""
+    monkeypatch.setattr(bench_fit, "PASSES", 60)
+    fitted, checked = bench_fit.detection()
+    assert (fitted["rows"], fitted["rungs"], checked["runs"]) == (6000, 4, 500)
+    assert fitted["share"] == pytest.approx(0.6, abs=0.1)
 
 
 def test_the_table_of_the_page_about_memory_is_what_its_tool_prints() -> None:

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+Note = Callable[[Any, str], Any]
+"""A value of a key, with words about it, as it is to be written."""
+
+
+PER_ROW = "per row"
+"""Metadata of a field that has a value for each row of the data: none of the numbers that are reported."""
+
+
+def plain(value: Any, words: str) -> Any:
+    """The value alone."""
+    return value
+
+
+def digits(value: float, count: int = 4) -> float:
+    """To so many significant digits: no interval tells more."""
+    return float(f"{value:.{count}g}")
 
 
 @dataclass(frozen=True)
 class Estimate:
     """`value` with its 95 % interval, from `n` observations that are worth `n_effective` independent ones.
 
-    `why`: set where the data do not tell the number; then `value` is what is used in its place, and `low` and `high`
-    are what the data leave open (NaN: anything). `chosen`: nobody asked the data for it.
+    `n_effective` NaN: it is not known. `why`: set where the data do not tell the number; then `value` is what is used
+    in its place, and `low` and `high` are what the data leave open (NaN: anything). `chosen`: nobody asked the data for
+    it.
 
     >>> Estimate(0.9, 0.85, 0.94, n=400, n_effective=120.0).words()
     '0.9 (95 %: 0.85 … 0.94, n 400, effective 120)'
@@ -32,5 +53,5 @@ class Estimate:
             return f"not identifiable: {self.why}"
         if self.chosen:
             return "chosen"
-        spread = f"95 %: {self.low:.3g} … {self.high:.3g}, n {self.n}, effective {self.n_effective:.3g}"
-        return f"{self.value:.3g} ({spread})"
+        effective = "" if math.isnan(self.n_effective) else f", effective {self.n_effective:.3g}"
+        return f"{self.value:.3g} (95 %: {self.low:.3g} … {self.high:.3g}, n {self.n}{effective})"

@@ -34,8 +34,10 @@ class FitRows:
     object from the unit. `listed`: whether the list has an entry of it. Of entries, NaN or −1 where not listed:
     errors `along_m` and `across_m` of the line of sight (entry − truth; along: outwards, across: to its left; the
     delay removed), `east_m`, `north_m` the same in easting and northing, `yaw_rad` wrapped, `speed_mps`, `size_m`
-    (3, R) of length, width and height; NaN, too, where the lists have no such field. `class_ix` and `existence` as
-    listed, `track_id`. `state (R, 2)`: the true easting and northing. `fold`: which part of a cross-validation.
+    (3, R) of length, width and height; NaN, too, where the lists have no such field, and where another true object is
+    so near that the entry may be about either. `class_ix`, `existence` and `track_id` as listed. `state_m (R, 2)`: the
+    true easting and northing. `fold`: which part of a cross-validation. `apart`: whether no other true object is so
+    near; None: of none.
     """
 
     list: Int
@@ -57,11 +59,12 @@ class FitRows:
     existence: Float
     track_id: Int
     fold: Int
+    apart: Bool | None = None
 
     def take(self, rows: Int | Bool) -> FitRows:
         """Some rows, in their order."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else rows
-        out = {f.name: getattr(self, f.name) for f in fields(self)}
+        out = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         return FitRows(
             **{
                 name: value.take(rows) if name == "view" else value[:, rows] if name == "size_m" else value[rows]

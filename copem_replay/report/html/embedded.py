@@ -11,6 +11,8 @@ from copem_replay.report.html.greys import as_variables
 from copem_replay.report.html.markup import Html, tag
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from copem_replay.results.read import Results
 
 _NOT_DRAWN = re.compile(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style .*?</style>\s*", re.DOTALL)
@@ -26,8 +28,13 @@ def _larger(size: re.Match[str]) -> str:
 
 def embedded(name: str, kind: FigureKind, results: Results, selection: Selection) -> Html:
     """A figure as an element of a page, as wide as it was drawn where there is room. Raises RecordingError."""
-    svg = rendered(kind.draw(results, selection), (".svg",))[".svg"].decode("utf-8")
+    return drawn(name, kind.draw(results, selection), kind.title, kind.shows)
+
+
+def drawn(name: str, figure: Figure, title: str, shows: str) -> Html:
+    """A figure that has been made as an element of a page; `shows`: for readers who cannot see it."""
+    svg = rendered(figure, (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # texts are in comments, too: as users wrote them
     svg = as_variables(_SIZE.sub(_larger, _IDS.sub(f"{name}-", svg), count=1))
-    plot = tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=kind.shows)
-    return tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=kind.title)
+    plot = tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=shows)
+    return tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 
 from copem_replay.report.figures.registry import FIGURES, Selection
 from copem_replay.report.html.conclusions import lead, more
 from copem_replay.report.html.embedded import embedded
-from copem_replay.report.html.greys import dark_greys
 from copem_replay.report.html.latency_breakdown import stage_table
-from copem_replay.report.html.markup import Html, joined, listed, tag, text
+from copem_replay.report.html.markup import Html, joined, tag
 from copem_replay.report.html.missed_objects import never_detected, without_a_draw
 from copem_replay.report.html.provenance import provenance
 from copem_replay.report.html.setup import configurations, question, setting
 from copem_replay.report.html.study import Study
 from copem_replay.report.html.swatches import swatch
 from copem_replay.report.html.tables import baseline_words, regret_table, summary_tables
+from copem_replay.report.html.whole import contents, whole_page
 
-_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
-"""What a browser lets the page load: nothing."""
 _ANSWER, _DIFFERENCES = "answer", "differences"
 _BELOW = {"latency_breakdown": stage_table}
 """What stands below a figure."""
@@ -54,15 +51,12 @@ def page(study: Study) -> str:
         lead(study),
         *([_embedded(study, _ANSWER)] if measured else []),
         more(study),
-        _contents(sections),
+        contents((one.id, one.title) for one in sections),
         *([_key(study)] if measured and len(study.names) > 1 else []),
     )
-    return _whole(title, joined([head, *(tag("section", tag("h2", s.title), *s.parts, id_=s.id) for s in sections)]))
-
-
-def _contents(sections: Sequence[_Section]) -> Html:
-    links = [tag("a", one.title, href=f"#{one.id}") for one in sections]
-    return tag("nav", listed(links), aria_label="Contents", class_="screen")
+    return whole_page(
+        title, joined([head, *(tag("section", tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
+    )
 
 
 def _embedded(study: Study, name: str) -> Html:
@@ -100,20 +94,3 @@ def _key(study: Study) -> Html:
     every = [tag("button", word, type="button", data_every=word) for word in ("all", "none")]
     said = tag("span", "Shown in the figures:", class_="screen")
     return tag("div", said, *buttons, tag("span", *every, class_="screen"), class_="key", id_="key")
-
-
-def _whole(title: str, body: Html) -> str:
-    own = files("copem_replay.report.html")
-    style, script = ((own / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-            '<meta name="color-scheme" content="light dark">',
-            '<link rel="icon" href="data:,">',
-            f"<title>{text(title)}</title>\n<style>\n{style}{dark_greys(body)}</style>\n</head>\n<body>\n<main>",
-            body,
-            f"</main>\n<script>\n{script}</script>\n</body>\n</html>\n",
-        ]
-    )

@@ -1,0 +1,69 @@
+"""What the folders of all kinds of results hold alike: tables, versions, and which recordings they are of."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from copem_replay.experiment.file import at_place
+from copem_replay.experiment.schema import LogSettings
+from copem_replay.experiment.validate import place_of
+from copem_replay.io.checksum import sha256_of
+from copem_replay.io.recording import Recording
+from copem_replay.io.truth_digest import truth_digest
+
+_LIBRARIES = (
+    "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
+    "scipy", "shapely",
+)  # fmt: skip
+ROWS_A_GROUP = 1 << 20
+"""Rows of a row group of Parquet, at most (that is Arrow's)."""
+
+
+def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
+    """`logs` as the folder has it: a path relative to it each, with the log's settings where it has some."""
+
+    def called(path: Path) -> str:
+        return os.path.relpath(place_of(path), folder)
+
+    settings = [entry for entry in logs if isinstance(entry, LogSettings)]
+    if len(settings) < len(recordings):
+        return [called(recording.path) for recording in recordings]
+    moved = (at_place(one, r.place, called) for one, r in zip(settings, recordings, strict=True))
+    return [one.model_dump(mode="json", by_alias=True) for one in moved]
+
+
+def versions() -> dict[str, object]:
+    """Of this project, of Python, and of what decides on numbers."""
+    return {
+        "copem_replay": version("copem-replay"),
+        "python": platform.python_version(),
+        "libraries": {name: version(name) for name in _LIBRARIES},
+    }
+
+
+def said_of_logs(recordings: Sequence[Recording]) -> list[dict[str, object]]:
+    """Which recordings they were, by their content."""
+    return [
+        {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.place), "truth": truth_digest(r.scene, r.truth)}
+        for r in recordings
+    ]
+
+
+def write_parquet(table: Any, path: Path) -> None:
+    """A table, of pandas or of Arrow, as Parquet: NaN as null, text as `string` whatever pandas keeps it in."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
+    fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
+    arrow = arrow.cast(pa.schema(fields, arrow.schema.metadata))
+    with parquet.ParquetWriter(path, arrow.schema, compression="zstd") as writer:
+        for k in range(0, max(len(arrow), 1), ROWS_A_GROUP):  # of one piece each, however the table was put together
+            writer.write_table(arrow.slice(k, ROWS_A_GROUP).combine_chunks(), row_group_size=ROWS_A_GROUP)
