@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema
 from scipy.special import gammaincinv, ndtri
 
 from copem_replay.core.components import Component, GivenError, Latency, Positive, Slot, asked
@@ -110,5 +111,12 @@ def _seconds(value: object) -> object:
     return {"kind": "constant", "s": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-Delay = Annotated[LatencyModel, Slot("latency", LATENCIES), BeforeValidator(_seconds)]
+class _OrSeconds:
+    """JSON Schema: a number stands beside the components."""
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [{"type": "number", "minimum": 0, "maximum": 86_400}, *handler(schema)["anyOf"]]}
+
+
+Delay = Annotated[LatencyModel, Slot("latency", LATENCIES), BeforeValidator(_seconds), _OrSeconds()]
 """A latency model; a number is a constant one."""
