@@ -7,29 +7,57 @@ import resource
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from copem_replay.core.errors import ExperimentError
 from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.list_rates import list_times
 from copem_replay.pipeline.prepare import Replay
 
-AT_LEAST_BYTES = {False: 250, True: 400}
-"""Of a row of `detections.parquet`, without accuracy and with it, while all are put together (measured: 146 and 234 of
-the row itself, held twice)."""
-ABOUT_BYTES = {False: 1000, True: 5000}
-"""The same with all that is made on the way, statistics too (measured: 500 and 4000)."""
+AT_LEAST_BYTES = {False: (250, 0), True: (400, 16)}
+"""Of a row of `detections.parquet`, and of each list of its object's stay, without accuracy and with it, while all are
+put together (measured: 146 and 234 of the row itself, held twice; of a list two numbers of four bytes, held twice)."""
+ABOUT_BYTES = {False: (1000, 0), True: (3000, 45)}
+"""The same with all that is made on the way, statistics too. Measured, by how much the peak of `run` without `show` and
+`sweep` grows from one number of runs to the other, in bytes a row:
+
+| | runs | lists a row | grows by |
+|---|---|---|---|
+| crossing_share.yaml without accuracy | 120, 480 | 0 | 650 |
+| tc016d.yaml | 2000, 10 000 | 76 | 6000 |
+| crossing_share.yaml | 120, 480 | 431 | 23 500 |
+| crossing.yaml | 10, 80 | 979 | 41 200 |
+"""
 
 
 def memory_notes(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
     """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do."""
+    accuracy, free = experiment.measure.accuracy, free_bytes()
     rows_a_run = sum(len(r.episodes.object_ix) * len(r.expanded.written.configurations) for r in ready)
-    about, free = rows_a_run * ABOUT_BYTES[experiment.measure.accuracy], free_bytes()
+    lists_a_run = sum(map(_lists_a_run, ready)) if accuracy else 0.0
+    about, least = (
+        round(rows_a_run * row[accuracy][0] + lists_a_run * row[accuracy][1]) for row in (ABOUT_BYTES, AT_LEAST_BYTES)
+    )
     if free is None or about * experiment.runs <= free:
         return []
     few = max(free // about, 1)
     rows = f"{experiment.runs} runs of {rows_a_run} {'row' if rows_a_run == 1 else 'rows'} each"
-    least = rows_a_run * experiment.runs * AT_LEAST_BYTES[experiment.measure.accuracy]
-    if least > free and experiment.runs > 1:
-        raise ExperimentError(f"{rows} take at least {_gb(least)}, and {_gb(free)} are free; take {few} or fewer")
+    if least * experiment.runs > free and experiment.runs > 1:
+        raise ExperimentError(
+            f"{rows} take at least {_gb(least * experiment.runs)}, and {_gb(free)} are free; take {few} or fewer"
+        )
     return [f"{rows} may take {_gb(about * experiment.runs)}, and {_gb(free)} are free"]
+
+
+def _lists_a_run(replay: Replay) -> float:
+    """About how many lists the stays of a run's rows have: by the seconds from first frame to the episode's end."""
+    truth, episodes = replay.truth, replay.episodes
+    first_s = np.full(len(replay.scene.object_ids), np.inf)
+    np.minimum.at(first_s, truth.row_object_ix, truth.captured_s[truth.frame_ix])
+    stays_s = float((episodes.ended_s - first_s[episodes.object_ix]).sum())
+    once = replay.expanded.written.model_copy(update={"runs": 1})
+    rates = (times.rate_hz or 0.0 for times in list_times(replay, once).values())
+    return stays_s * sum(rates)
 
 
 def free_bytes() -> int | None:

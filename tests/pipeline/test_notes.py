@@ -170,7 +170,10 @@ def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
 
 
 class TestMemory:
-    """One object has an onset: in three configurations three rows a run, of 1000 bytes, or 250 at least."""
+    """One object has an onset: in three configurations three rows a run, of 1000 bytes, or 250 at least.
+
+    With accuracy of 3000, or 400, and of 45, or 16, for each list of the object's stay: of 3 s at 10 Hz.
+    """
 
     def rows(self, here: Path) -> tuple[Experiment, list[Replay]]:
         experiment, _, ready = made(here, changed("runs: 1000000", "measure: {accuracy: false}"))
@@ -197,9 +200,20 @@ class TestMemory:
         with pytest.raises(ExperimentError, match=said):
             memory.memory_notes(ready, experiment)
 
+    def test_by_lists(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """3 × (3000 + 30 × 45) bytes a run; with a mast of 20 Hz, in one configuration, of another 30 lists."""
+        twice = "  mast: {at: [12.0, -4.5], height_m: 5.0, pem: onboard, rate_hz: 20}"
+        for change, bytes_a_run in (("seed: 1", 13_050), (twice, 14_400)):
+            experiment, _, ready = made(here, changed("runs: 1000", change))
+            with_free(monkeypatch, 1001 * bytes_a_run)
+            assert memory.memory_notes(ready, experiment) == []
+            with_free(monkeypatch, 999 * bytes_a_run)
+            (said,) = memory.memory_notes(ready, experiment)
+            assert f"may take {bytes_a_run / 1e6:.3g} GB" in said
+
     def test_run_refuses_before_it_begins(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         experiment, recordings, _ = made(here, changed("runs: 1000000000"))
-        with pytest.raises(ExperimentError, match=r"1000000000 runs of 3 rows each take at least 1\.2e\+03 GB"):
+        with pytest.raises(ExperimentError, match=r"1000000000 runs of 3 rows each take at least 2\.64e\+03 GB"):
             run(experiment, recordings)
 
     def test_what_is_free(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -378,7 +378,7 @@ class TestCheck:
         ended = call(command, "e.yaml")
         assert (ended.code, ended.out) == (2, "")
         (line,) = ended.lines
-        least = r"1000000000 runs of 3 rows each take at least 1\.2e\+03 GB"
+        least = r"1000000000 runs of 3 rows each take at least 2\.64e\+03 GB"
         assert re.fullmatch(rf"e\.yaml:3: runs: {least}, and .* GB are free; take \d+ or fewer", line)
         assert not (here / "out").exists()
 
@@ -387,7 +387,7 @@ class TestCheck:
     ) -> None:
         monkeypatch.setattr("copem_replay.pipeline.memory.free_bytes", lambda: 50_000)
         monkeypatch.setattr(gather, "outcomes", raising(OSError(5, "Input/output error")))
-        said = "note: 4 runs of 3 rows each may take 6e-05 GB, and 5e-05 GB are free"
+        said = "note: 4 runs of 3 rows each may take 5.22e-05 GB, and 5e-05 GB are free"
         assert call("check", "e.yaml").lines == [said]
         assert call("run", "e.yaml").lines == [said, "copem-replay: Input/output error"]
 
