@@ -28,7 +28,8 @@ Made by `tools/key_reference.py` from the schema (`copem-replay schema`). What t
 """
 _UNITS = {"s": "s", "m": "m", "m2": "m²", "hz": "Hz", "deg": "°", "rad": "rad", "mps": "m/s", "mps2": "m/s²",
           "mps3": "m/s³", "ppm": "ppm", "db": "dB", "kbps": "kbit/s", "bytes": "B", "share": "0 … 1", "iou": "0 … 1",
-          "probability": "0 … 1", "existence": "0 … 1", "rate": "0 … 1", "confidence": "0 … 1"}  # fmt: skip
+          "probability": "0 … 1", "existence": "0 … 1", "rate": "0 … 1", "confidence": "0 … 1",
+          "incidence": "0 … 1", "ece": "0 … 1", "min": "1/min"}  # fmt: skip
 _LONGEST = 80  # letters of an example; what is longer is made of keys that have their own
 _LARGEST = 1e9  # bounds from here on only keep numbers finite
 
@@ -117,7 +118,7 @@ class Reference:
             example = self.examples.get((title, key), "")
             shown = [f"`{text}`" if len(text) <= _LONGEST else "below" for text in (example,) if text]
             default = default if len(default) <= _LONGEST else "as below"
-            cells = [f"`{key}`", self._type(schema), default, _unit(key), *(shown or [""])]
+            cells = [f"`{key}`", self._type(schema), default, unit_of(key), *(shown or [""])]
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         return "\n".join(lines) + "\n"
 
@@ -161,11 +162,11 @@ def _bounds(schema: Schema) -> str:
     return " " + ", ".join(said) if said else ""
 
 
-def _unit(key: str) -> str:
-    words = key.split("_")
-    return (
-        _UNITS.get(words[-1], "") if len(words) > 1 or words[-1] in ("probability", "existence", "share", "iou") else ""
-    )
+def unit_of(key: str) -> str:
+    """The unit that ends a name; empty: none."""
+    alone = ("probability", "existence", "share", "iou", "incidence")  # other words alone are no units
+    *before, last = key.split("_")
+    return _UNITS.get(last, "") if before or last in alone else ""
 
 
 def _flow(value: Any) -> str:

@@ -302,7 +302,7 @@ _EXACT_METRICS = (
     _exact_missed("miss_log10", "log₁₀ of the mean probability that an episode misses its object"),
     _exact_missed("miss_log10_half_odds", "the same with the odds of every detection halved"),
     _exact_missed("miss_per_logit", "d ln of that probability by the log-odds of every detection"),
-    Metric("pass_share_exact", judged, itemgetter(0), 1, "the same without a draw", "braking"),
+    Metric("pass_share_exact", judged, itemgetter(0), 1, "pass_share without a draw", "braking"),
     Metric("fail_share_exact", judged, itemgetter(1), -1, "share that fails, without a draw; null below 10⁻¹⁵"),
 )
 

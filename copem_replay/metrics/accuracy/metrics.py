@@ -163,7 +163,7 @@ ACCURACY = (
            "the same at the instant the entry tells of", "accuracy"),
     Metric("bias_east_m", _TOTAL, bias_east_m, 0, "mean easting error, entry minus truth"),
     Metric("bias_north_m", _TOTAL, bias_north_m, 0, "mean northing error, entry minus truth"),
-    Metric("velocity_rmse_mps", _TOTAL, velocity_rmse_mps, -1, "of velocities", "accuracy"),
+    Metric("velocity_rmse_mps", _TOTAL, velocity_rmse_mps, -1, "root mean square error of velocities", "accuracy"),
     Metric("age_of_information_s", _TOTAL, age_of_information_s, -1, "available minus captured, mean", "accuracy"),
     Metric("gospa_m", _TOTAL, gospa_m, -1,
            "GOSPA of the lists: places, misses and false entries in one number", "lists",
