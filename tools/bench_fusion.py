@@ -89,7 +89,7 @@ def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterat
     world = ready.world(experiment)
     cut = blocks(ready, experiment, 2)[:2]
     seen = [seen_by_all(world, runs, states="sampled") for runs in cut]
-    told = [_without_truth(world, each, runs) for each, runs in zip(seen, cut, strict=True)]
+    told = [_without_truth(world, each, runs)[0] for each, runs in zip(seen, cut, strict=True)]
     with ThreadPoolExecutor(2) as pool:
         for name in world.experiment.configurations:
             parts = [_fusing(world, name, *each) for each in zip(seen, told, strict=True)]

@@ -107,6 +107,9 @@ class Inputs:
     are in a random order that is the same however the recording was ordered. Times are seconds since the log's start.
     They are what `ListFusion.fuse` is handed.
 
+    Of a unit whose messages leave objects out that are still there, `newest` says a list that is not among those that
+    `arrived`: what is known of it, the newest entry of each object, each with its own `captured_s`.
+
     >>> none = np.zeros(0, dtype=int)
     >>> lists = cr.ObjectLists(np.array([[0]]), cr.entries_of(0))
     >>> inputs = cr.Inputs(("ego",), none, none, none, lists, np.array([0.0]), np.array([[-1]]), none, np.array([0, 0]))
@@ -123,3 +126,4 @@ class Inputs:
     newest: Int  # (K, U) each unit's newest list that has arrived and is not too old; −1: none
     arrived: Int  # (A,) lists in order of arrival; lists that never arrive are not among them
     arrived_start: Int  # (K + 1,) `arrived[arrived_start[k] : arrived_start[k + 1]]` arrive at instant k
+    keeps_s: Float | None = None  # (U,) for how long an object that a unit's messages leave out may be there; None: 0

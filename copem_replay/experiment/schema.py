@@ -24,9 +24,11 @@ from pydantic import (
 
 from copem_replay.communication.latency import Delay
 from copem_replay.communication.link import ConstantLink, LinkModel, UnitLinks
+from copem_replay.communication.sends import Sends
 from copem_replay.core.components import Count, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.link_keys import AnyLink, IssueRate, LinkName, LinkOf
+from copem_replay.experiment.names import ConfigurationName, UnitName
 from copem_replay.experiment.show_keys import Show
 from copem_replay.experiment.sweep_keys import Sweep
 from copem_replay.fusion import FUSIONS
@@ -36,12 +38,6 @@ from copem_replay.metrics.config import Braking, Measure
 from copem_replay.perception.config import Carriers, Obstacle, Placement
 from copem_replay.perception.pem.model import Pem
 from copem_replay.perception.visibility import Surface, Visibility
-
-
-def _unit_name(value: str) -> str:
-    if value in ("default", "truth", "all", ""):
-        raise ValueError(f"{value!r} cannot be a unit's name")
-    return value
 
 
 def _of_64_bits(value: int) -> int:
@@ -56,22 +52,12 @@ def _version(value: object) -> object:
     return value
 
 
-def _configuration_name(value: str) -> str:
-    # The name is part of topics and of entity paths.
-    if not value or "/" in value or not value.isprintable():
-        raise ValueError(f"expected a printable name without '/', found {value!r}")
-    return value
-
-
-UnitName = Annotated[Id, AfterValidator(_unit_name)]
-ConfigurationName = Annotated[Id, AfterValidator(_configuration_name)]
-
-
 _NOT_RECORDED = {
     "placed": "is where its lists say",
     "clock": "captures when its lists say",
     "outages": "makes the lists that are recorded",
     "ready": "arrives when its lists say",
+    "sends": "sends what is recorded",
 }
 
 
@@ -79,7 +65,7 @@ class Unit(Placement):
     """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
 
     One whose lists are recorded has no PEM, and needs a place only where distances are measured from it. `ready`: how
-    long after its capture a list is there to be sent.
+    long after its capture a list is there to be sent; `sends`: which lists, and what of them.
 
     >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
     True
@@ -87,6 +73,7 @@ class Unit(Placement):
 
     recorded: Recorded | None = None
     ready: Delay | None = Field(default=None, exclude_if=lambda ready: ready is None)
+    sends: Sends | None = Field(default=None, exclude_if=lambda sends: sends is None)
 
     @model_validator(mode="after")
     def _place(self) -> Self:

@@ -21,7 +21,7 @@ from copem_replay.fusion.gnn_kernel import POINT, Clusters, join, write_entry
 
 @nb.njit(cache=True, nogil=True)
 def unite(
-    clusters: Clusters, fused: Entries, entries: Entries, captured_s: Float, arrives_s: Float, agree: Bool, gate: float
+    clusters: Clusters, fused: Entries, entries: Entries, arrives_s: Float, agree: Bool, gate: float
 ) -> tuple[Clusters, Entries]:
     """The clusters and what each says, those in conflict joined. `gate`: d² beyond which a member contradicts.
 
@@ -54,7 +54,7 @@ def unite(
                     _take_in(state[0], point, gate)
                 for h in range(len(CLASSES)):
                     class_sum[h] += entries[point.row].class_probability[h]
-            write_entry(out[made], state[0], class_sum, members, clusters.points, entries, captured_s, arrives_s)
+            write_entry(out[made], state[0], class_sum, members, clusters.points, entries, arrives_s)
             made += 1
         start[k + 1] = made
     return Clusters(start, begin[: made + 1], member, clusters.points), out[:made]

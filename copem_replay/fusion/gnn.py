@@ -131,7 +131,7 @@ class Gnn(ListFusion):
 
     def _united(self, clusters: Clusters, fused: Entries, entries: Entries, inputs: Inputs) -> tuple[Clusters, Entries]:
         gate = -2 * math.log1p(-(self.gate if self.conflict_gate is None else self.conflict_gate))
-        return unite(clusters, fused, entries, inputs.captured_s, inputs.arrives_s, AGREE, gate)
+        return unite(clusters, fused, entries, inputs.arrives_s, AGREE, gate)
 
 
 def numbers(entries: Entries) -> Float:

@@ -109,7 +109,7 @@ def fuse_run(
         fused = _lengthened(fused, s, s + count)
         for c in range(count):
             members = member[begin[s + c] : begin[s + c + 1]]
-            write_entry(fused[s + c], states[c], class_sum[c], members, points, entries, captured_s, arrives_s)
+            write_entry(fused[s + c], states[c], class_sum[c], members, points, entries, arrives_s)
     made = start[instants]
     return Clusters(start, begin[: made + 1], member, points), fused[:made]
 
@@ -304,9 +304,8 @@ def _lengthened(entries: Entries, used: int, needed: int) -> Entries:
 
 @nb.njit(cache=True, nogil=True)
 def write_entry(
-    out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, captured_s: Float,
-    arrives_s: Float,
-) -> None:  # fmt: skip
+    out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, arrives_s: Float
+) -> None:
     """The fused entry of one cluster, whose position is that of its running state."""
     out.x_m, out.y_m = state.x_m, state.y_m
     out.cov_ee_m2, out.cov_en_m2, out.cov_nn_m2 = state.ee, state.en, state.nn
@@ -322,7 +321,7 @@ def write_entry(
         z, vx, vy = z + w * entry.z_m, vx + w * entry.vx_mps, vy + w * entry.vy_mps
         length, width, height = length + w * entry.length_m, width + w * entry.width_m, height + w * entry.height_m
         nobody *= 1 - entry.existence
-        newest_s = max(newest_s, captured_s[point.list])
+        newest_s = max(newest_s, entry.captured_s)
         at_s = arrives_s[point.list]
         if at_s < earliest_s or (at_s == earliest_s and entry.unit_ix < out.unit_ix):
             earliest_s = at_s

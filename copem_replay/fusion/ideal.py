@@ -14,6 +14,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
+from copem_replay.communication.kept import KeptEntries, Sent, kept_entries
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
@@ -24,16 +25,25 @@ SMALLEST_VARIANCE = 1e-9
 
 
 def fuse(
-    heard: Tracks, *, max_age_s: float, without_object_ix: int = -1, at: FusionSchedule | None = None
+    heard: Tracks,
+    *,
+    max_age_s: float,
+    without_object_ix: int = -1,
+    at: FusionSchedule | None = None,
+    kept: KeptEntries | None = None,
 ) -> FusedTracks:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`. `at`: some of the instants.
+
+    `kept`: what the receiver has of units whose messages are partial, of `kept_by_object`; None: there are none.
 
     `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
     `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
     """
     at = at or fusion_schedule(heard, max_age_s=max_age_s)
-    rows, start, object_ix, instant = _contributions(heard, at.newest, without_object_ix)
+    rows, start, object_ix, instant = _contributions(
+        heard, at.newest if kept is None else kept.newest, without_object_ix, kept
+    )
     valid = _any(heard.valid, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     given = Positions(heard.x_m, heard.y_m, *floored(heard))
@@ -78,17 +88,33 @@ def draw_posterior(fused_tracks: FusedTracks, scene: Scene, seed: int, runs: Int
     return replace(fused_tracks, fused=drawn)
 
 
-def _contributions(heard: Tracks, newest: Int, without_object_ix: int) -> tuple[Int, Int, Int, Int]:
+def kept_by_object(
+    heard: Tracks, partial: Bool, schedule: FusionSchedule, at: FusionSchedule, *, max_age_s: float
+) -> KeptEntries:
+    """Of units (U,) whose messages are `partial` the newest row of each object, in one run; entries go by frame."""
+    order, bounds = heard.by_frame
+    known = heard.valid[0] & (heard.row_object_ix >= 0)
+    of = np.unique(np.stack([heard.row_unit_ix, heard.row_object_ix]), axis=1, return_inverse=True)[1].ravel()
+    return kept_entries(heard, Sent(bounds, np.where(known, of, -1)[order]), partial, schedule, at, max_age_s=max_age_s)
+
+
+def _contributions(
+    heard: Tracks, newest: Int, without_object_ix: int, kept: KeptEntries | None
+) -> tuple[Int, Int, Int, Int]:
     """Which rows of `heard` make each fused row, grouped: rows (C,), start (P + 1,), object and instant (P,).
 
     Entries without truth id (of recorded units) are in none.
     """
     order, bounds = heard.by_frame
+    begin, count = bounds[:-1], np.diff(bounds)
+    if kept is not None:
+        begin, count = np.append(begin, kept.start[:-1] + len(order)), np.append(count, np.diff(kept.start))
+        order = np.append(order, order[kept.entry])
     instant, _unit = np.nonzero(newest >= 0)
     frame = newest[newest >= 0]
-    count = bounds[frame + 1] - bounds[frame]
+    begin, count = begin[frame], count[frame]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    rows = order[np.repeat(bounds[frame], count) + within]
+    rows = order[np.repeat(begin, count) + within]
     instant = np.repeat(instant, count)
     object_ix = heard.row_object_ix[rows]
     keep = (object_ix != without_object_ix) & (object_ix >= 0)

@@ -7,13 +7,14 @@ is left out, since it knows where it is.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba as nb
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
-from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, taken
+from copem_replay.communication.kept import KeptEntries
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, Inputs, ObjectLists, joined, taken
 from copem_replay.core.tracks import VALUES, Bool, Float, Int, Tracks
 from copem_replay.fusion.ideal import floored
 
@@ -29,20 +30,11 @@ class Claims:
 
 def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
     """The lists of all units in all runs, F in each of S. `drawn (S, P)`: by what entries of a list are ordered."""
-    kept = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
-    return _gathered(heard, claims, drawn, kept)
-
-
-def _gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> ObjectLists:
-    """Rows of `valid (S, P)` as lists, ordered by `drawn (S, P)`."""
-    order, bounds = heard.by_frame
-    start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
-    picked = np.empty(int(valid.sum()), dtype=np.int64)
-    _pick(valid, drawn, order, bounds, start, picked)
+    start, picked = listed_rows(heard, drawn, without_object_ix=without_object_ix)
     covariances = dict(zip(COVARIANCES, floored(heard), strict=True))
     template = _template(heard, claims, covariances)
     entries = taken(template, picked)
-    run = np.repeat(np.arange(len(valid)), valid.sum(axis=1))
+    run = np.repeat(np.arange(len(start)), start[:, -1] - start[:, 0])
     for name in VALUES:
         values = getattr(heard, name)
         if len(values) > 1:
@@ -51,6 +43,16 @@ def _gathered(heard: Tracks, claims: Claims, drawn: Float, valid: Bool) -> Objec
         if len(values) > 1:
             entries[name] = values[run, picked]
     return ObjectLists(start, entries)
+
+
+def listed_rows(heard: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
+    """Where each of these lists begins, (S, F + 1), and the row of each entry, (N,)."""
+    valid = heard.valid if without_object_ix < 0 else heard.valid & (heard.row_object_ix != without_object_ix)
+    order, bounds = heard.by_frame
+    start = np.zeros((len(valid), len(bounds)), dtype=np.int64)
+    picked = np.empty(int(valid.sum()), dtype=np.int64)
+    _pick(valid, drawn, order, bounds, start, picked)
+    return start, picked
 
 
 def inputs(
@@ -71,6 +73,21 @@ def inputs(
         heard.units, heard.frame_unit_ix, captured_s, heard.common_arrives_s, lists,
         at.issue_s, at.newest, at.arrived, at.arrived_start,
     )  # fmt: skip
+
+
+def with_kept(told: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
+    """The same in one run with what the receiver has of units (U,) whose messages are `partial`, for `max_age_s`."""
+    lists, frame = told.lists, kept.frame
+    start = np.concatenate([lists.start[0], lists.start[0, -1] + kept.start[1:]])[None]
+    return replace(
+        told,
+        unit_ix=np.append(told.unit_ix, told.unit_ix[frame]),
+        captured_s=np.append(told.captured_s, told.captured_s[frame]),
+        arrives_s=np.append(told.arrives_s, told.arrives_s[frame]),
+        lists=ObjectLists(start, joined([lists.entries, taken(lists.entries, kept.entry)])),
+        newest=kept.newest,
+        keeps_s=np.where(partial, max_age_s, 0.0),
+    )
 
 
 def _template(heard: Tracks, claims: Claims, covariances: Mapping[str, Float]) -> Entries:

@@ -67,7 +67,7 @@ def _order(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
     f = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
     keys = np.column_stack(
         [
-            -entries["existence"], entries["cov_ee_m2"] + entries["cov_nn_m2"], -inputs.captured_s[f],
+            -entries["existence"], entries["cov_ee_m2"] + entries["cov_nn_m2"], -entries["captured_s"],
             numbers(entries)[:, :WIDTH], inputs.arrives_s[f], inputs.unit_ix[f],
         ]
     )  # fmt: skip

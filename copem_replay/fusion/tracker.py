@@ -88,10 +88,11 @@ class Tracker(ListFusion):
 
     def resume(self, inputs: Inputs, memory: Sequence[Remembered] | None) -> tuple[ObjectLists, Sequence[Remembered]]:
         """The same at the next instants. What is remembered is of each run its tracks."""
+        keeps_s = np.zeros(len(inputs.units)) if inputs.keeps_s is None else inputs.keeps_s
         rules = Rules(
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),
             self.forget_s, self.publish, self.drop, self.confirm_s, self.buffer_s, AGREE,
-            self.errors_last_s or 0.0, self.common_share or 0.0,
+            self.errors_last_s or 0.0, self.common_share or 0.0, keeps_s, self.forget_s + keeps_s.max(initial=0.0),
         )  # fmt: skip
         arrived, start = _gone_by(inputs) if self.late == "stale" else (inputs.arrived, inputs.arrived_start)
         so_far = memory or [nothing_yet(len(inputs.units))] * len(inputs.lists.start)
@@ -104,7 +105,10 @@ class Tracker(ListFusion):
 def _gone_by(inputs: Inputs) -> tuple[Int, Int]:
     """What arrives, and where that of each instant begins, without what a newer list of its unit has outrun."""
     instant = np.repeat(np.arange(len(inputs.issue_s)), np.diff(inputs.arrived_start))
-    kept = inputs.newest[instant, inputs.unit_ix[inputs.arrived]] == inputs.arrived
+    newest = inputs.newest[instant, inputs.unit_ix[inputs.arrived]]
+    kept = newest == inputs.arrived
+    if inputs.keeps_s is not None:  # what is known of a unit with partial messages is no list that arrived
+        kept |= (newest >= 0) & (inputs.captured_s[newest] == inputs.captured_s[inputs.arrived])
     start = np.append(0, np.cumsum(np.bincount(instant[kept], minlength=len(inputs.issue_s))))
     return inputs.arrived[kept], start.astype(np.int64)
 

@@ -62,6 +62,8 @@ class Rules(NamedTuple):
     agree: Bool  # (C, C)
     errors_last_s: float  # 0: errors are fresh in every list
     common_share: float
+    keeps_s: Float  # (U,) for how long what a unit's messages leave out may be there: no claim fades before
+    apart_s: float  # a list that held two tracks tells for so long that they are two
 
 
 # ------------------------------------------------------------------------------------------------------------- one run
@@ -301,9 +303,11 @@ def _describe(track: Any, entry: Any, captured_s: float) -> None:
 def _existence(claims: NDArray[Any], rules: Rules, now_s: float) -> float:
     """1 − Πᵤ (1 − cᵤ e^(−(now − tᵤ)/forget)) of one track, `claims (U,)`."""
     none = 1.0
-    for claim in claims:
+    for u in range(len(claims)):
+        claim = claims[u]
         if claim.existence > 0.0:
-            none *= 1.0 - claim.existence * math.exp(-max(now_s - claim.at_s, 0.0) / rules.forget_s)
+            faded_s = max(now_s - claim.at_s - rules.keeps_s[u], 0.0)
+            none *= 1.0 - claim.existence * math.exp(-faded_s / rules.forget_s)
     return 1.0 - none
 
 
@@ -338,7 +342,7 @@ def _one_object(memory: Memory, rules: Rules, i: int, j: int, now_s: float) -> b
     ee, nn = a.P[0, 0] + a.ee + b.P[0, 0] + b.ee, a.P[1, 1] + a.nn + b.P[1, 1] + b.nn
     if dx * dx + dy * dy > SAME_OBJECT * (ee + nn) or not rules.agree[a.class_ix, b.class_ix]:
         return False
-    if memory.together_s[i, j] >= now_s - rules.forget_s:
+    if memory.together_s[i, j] >= now_s - rules.apart_s:
         return False
     return distance2(dx, dy, ee, a.P[0, 1] + a.en + b.P[0, 1] + b.en, nn) <= SAME_OBJECT
 

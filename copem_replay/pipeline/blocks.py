@@ -20,6 +20,7 @@ from copem_replay.metrics.line_of_sight import in_sight_s
 from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.conversions import as_fused_tracks
 from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.on_air import OnAir
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.presence import Presence
 from copem_replay.pipeline.receiver import ReceiverOutput, Receivers, WorldChunk, by_truth, listen, seen_by_all
@@ -199,7 +200,7 @@ def _by_truth_id(
         return {}
     on_air = replay.on_air(experiment, runs, presence.listing)
     lists = WorldChunk(replay.scene, replay.truth, replay.measured, replay.recorded, units, on_air=on_air)
-    seen = _sightings(replay, units, runs, presence)
+    seen = _sightings(replay, units, runs, presence, on_air)
     events: dict[str, Events] = {}
     for name, configuration in chosen.items():
         heard = listen(seen, lists, name, presence.sending)
@@ -209,12 +210,15 @@ def _by_truth_id(
             confirm=experiment.measure.confirm,
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
+            partial=units.partial,
         )
         events[name] = Events(heard.units, result, sight_s[name])
     return events
 
 
-def _sightings(replay: Replay, experiment: ExpandedExperiment, runs: Int, presence: Presence) -> Tracks:
+def _sightings(
+    replay: Replay, experiment: ExpandedExperiment, runs: Int, presence: Presence, on_air: OnAir | None
+) -> Tracks:
     """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
     pieces = []
     for chunk in replay.chunks:
@@ -223,7 +227,7 @@ def _sightings(replay: Replay, experiment: ExpandedExperiment, runs: Int, presen
         recorded = None
         if replay.recorded is not None:
             recorded = replay.recorded.captured_between(chunk.from_s, chunk.until_s)
-        world = WorldChunk(replay.scene, replay.truth, found, recorded, experiment, chunk)
+        world = WorldChunk(replay.scene, replay.truth, found, recorded, experiment, chunk, on_air=on_air)
         seen = seen_by_all(world, runs, states="true", equipped=presence.listing)
         if chunk == WHOLE:
             return seen

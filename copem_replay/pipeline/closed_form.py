@@ -70,6 +70,8 @@ def _check_truth_ids(experiment: Experiment) -> None:
             why = f"unit {min(recorded)} is recorded, and nothing says how probable its lists were"
         elif off := [n for n in experiment.units_of(configuration) if experiment.units[n].outages is not None]:
             why = f"unit {off[0]} has outages, in which all objects miss all lists together"
+        elif off := [n for n in experiment.units_of(configuration) if experiment.units[n].sends is not None]:
+            why = f"unit {off[0]} sends by rules (`sends`) that go by what it sent before"
         else:
             continue
         raise ExperimentError(f"exact: configuration {name}: {why}, which has no closed form; leave `exact` out")

@@ -16,6 +16,7 @@ import numpy as np
 
 from copem_replay.communication.latency import LatencyModel
 from copem_replay.communication.link import UnitLinks
+from copem_replay.communication.sends import Sends
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
@@ -117,6 +118,16 @@ class ExpandedExperiment:
         """How long units take until a list is there to be sent, of those that take any time."""
         return {name: unit.ready for name, unit in self.modelled.items() if unit.ready is not None}
 
+    @property
+    def sends(self) -> dict[str, Sends]:
+        """What units send of their lists, of those that do not send them as they are."""
+        return {name: unit.sends for name, unit in self.modelled.items() if unit.sends is not None}
+
+    @property
+    def partial(self) -> list[str]:
+        """The units whose messages leave objects out."""
+        return [name for name, sends in self.sends.items() if sends.partial]
+
     def links_of(self, name: str) -> list[UnitLinks]:
         """The links of one of these configurations."""
         return self._expanded.links_of(name)
@@ -126,6 +137,7 @@ class ExpandedExperiment:
         """Whether lists arrive otherwise from run to run: each run then has lists, and instants, of its own."""
         return (
             self.outages
+            or bool(self.sends)
             or any(ready.fixed_s is None for ready in self.ready.values())
             or any(one.link.drawn for name in self.configurations for one in self.links_of(name))
         )

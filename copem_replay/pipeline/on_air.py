@@ -19,18 +19,20 @@ from copem_replay.core.tracks import TRUTH, Float, Int, Scene, Tracks
 if TYPE_CHECKING:
     from copem_replay.perception.observation import Observations
     from copem_replay.pipeline.expansion import ExpandedExperiment
+    from copem_replay.pipeline.sent import SentObjects
 
 
 @dataclass(frozen=True)
 class OnAir:
     """Of the lists (F,) of all units in one run: the way of each to the ego, and how many objects it has.
 
-    None where no link asks for it.
+    None where no link asks for it. `sent`: what of them units send; None: every unit sends what it lists.
     """
 
     run: int
     path: RadioPath | None
     objects: Int | None
+    sent: SentObjects | None = None
 
     def of(self, lists: Tracks, scene: Scene, seed: int) -> Air:
         """What links of these lists go by; of the truth's there is no way, and no size."""

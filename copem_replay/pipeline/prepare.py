@@ -28,8 +28,9 @@ from copem_replay.pipeline.chunking import Reach, time_chunks
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand
 from copem_replay.pipeline.on_air import OnAir, asks_for_path, has_channel, paths
 from copem_replay.pipeline.presence import Presence
-from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
+from copem_replay.pipeline.receiver import WorldChunk, ghosts_of, listen, seen_by_all
 from copem_replay.pipeline.scoring import TruthCache
+from copem_replay.pipeline.sent import ClaimedRows, claimed_rows, sent_objects
 from copem_replay.pipeline.stated_captures import stated_captures
 
 
@@ -178,14 +179,29 @@ class Replay:
         if not units.arrivals_differ:
             return None
         path = self.paths if asks_for_path(units, self.scene) else None
-        return OnAir(int(runs[0]), path, self._listed(units, runs, equipped) if has_channel(units) else None)
+        on_air = OnAir(int(runs[0]), path, None)
+        if units.sends:
+            on_air = replace(on_air, sent=sent_objects(units, self._listed_in(units, runs, equipped)))
+        return replace(on_air, objects=self._counts(units, runs, equipped, on_air)) if has_channel(units) else on_air
 
-    def _listed(self, units: ExpandedExperiment, runs: Int, equipped: Bool | None) -> Int:
+    def _listed_in(
+        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None
+    ) -> Iterator[tuple[WorldChunk, Tracks, ClaimedRows]]:
+        """What the modelled units list in one run, chunk by chunk."""
+        for chunk in self.chunks:
+            found = self.found(chunk).listable
+            world = WorldChunk(self.scene, self.truth, found, None, units, chunk, self.placed, chunk.from_s)
+            ghosts = ghosts_of(world, runs)
+            seen = seen_by_all(world, runs, states="sampled", equipped=equipped, ghosts=ghosts)
+            yield world, seen, claimed_rows(world, runs, ghosts)
+
+    def _counts(self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, on_air: OnAir) -> Int:
         """(F,) how many objects each list of one run has; ghosts are not counted."""
         counts = np.zeros(0, dtype=np.int64)
         for chunk in self.chunks:
             recorded = None if self.recorded is None else self.recorded.captured_between(chunk.from_s, chunk.until_s)
-            world = WorldChunk(self.scene, self.truth, self.found(chunk).listable, recorded, units, chunk)
+            found = self.found(chunk).listable
+            world = WorldChunk(self.scene, self.truth, found, recorded, units, chunk, on_air=on_air)
             seen = seen_by_all(world, runs, states="true", equipped=equipped)
             of_chunk = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
             counts = of_chunk + counts if len(counts) else of_chunk

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
+from copem_replay.communication.kept import Sent, kept_entries
 from copem_replay.communication.link import transmit
 from copem_replay.communication.ready import when_ready
 from copem_replay.core.followed import followed_by
@@ -17,19 +18,19 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import ObjectLists, TellsOf
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.time_chunk import WHOLE, TimeChunk
-from copem_replay.core.tracks import CLASSES, TRUTH, Bool, Float, Int, Scene, Tracks, joined
+from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Scene, Tracks, joined
 from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
-from copem_replay.fusion.ideal import draw_posterior, fuse
-from copem_replay.fusion.inputs import Claims, inputs, lists_without_truth
-from copem_replay.perception.claims import claims_of
+from copem_replay.fusion.ideal import draw_posterior, fuse, kept_by_object
+from copem_replay.fusion.inputs import Claims, inputs, listed_rows, lists_without_truth, with_kept
 from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.outages import without_outages
-from copem_replay.perception.perceive import draws_of, perceive, with_states
+from copem_replay.perception.perceive import perceive, with_states
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.sent import claimed_rows
 from copem_replay.pipeline.stated_captures import StatedCaptures, stated_captures
 
 if TYPE_CHECKING:
@@ -121,6 +122,9 @@ def seen_by_all(
         seen = followed_by(seen, with_states(world.scene, ghosts.found.tracks, ghosts.found, experiment, drawn))
     seen = without_outages(world.scene, seen, experiment, runs)
     seen = when_ready(seen, experiment.ready, CounterRng(experiment.seed, world.scene.log), runs)
+    if world.on_air is not None and (sent := world.on_air.sent) is not None:
+        words = object_words(world.scene.object_ids)[world.found.tracks.row_object_ix]
+        seen = sent.of(seen, words if ghosts is None else np.concatenate([words, ghosts.words]))
     if world.recorded is None:
         return seen
     recorded = world.recorded.tracks
@@ -184,10 +188,11 @@ class Receivers:
         """
         experiment = world.experiment
         seen: dict[States, Tracks] = {}  # each is made when first needed
-        without_truth: list[ObjectLists] = []
-        last: tuple[tuple[bool, States, bytes], FusedTracks] | None = None
+        without_truth: list[tuple[ObjectLists, Int]] = []
+        partial = np.array([one in experiment.partial for one in experiment.units], dtype=bool)
+        last: tuple[tuple[bool, States, bytes, bytes], FusedTracks] | None = None
 
-        ghosts = self._ghosts(world)
+        ghosts = ghosts_of(world, self._runs)
 
         def seen_in(states: States) -> Tracks:
             if states not in seen:
@@ -206,18 +211,22 @@ class Receivers:
             faults = None if of_truth else _faults(world, seen_in(states), None if posterior else ghosts)
             if isinstance(fusion, Ideal) and faults is not None:
                 faults = replace(faults, ghosts=faults.ghosts[:0])  # it knows them for what they are
-            at = self._schedules[name].between(world.chunk.from_s, world.chunk.until_s)
+            schedule = self._schedules[name]
+            at = schedule.between(world.chunk.from_s, world.chunk.until_s)
             whole = world.chunk == WHOLE
             if isinstance(fusion, ListFusion):
                 if not without_truth:
                     without_truth.append(_without_truth(world, seen_in("sampled"), self._runs, ghosts))
-                stated, lists = None, without_truth[0]
+                stated, (lists, same) = None, without_truth[0]
                 if experiment.runs_apart:  # then the block has one
                     stated = stated_captures(world.scene, heard, experiment, int(self._runs[0]))
                 if stated is not None:
                     lists = stated.as_told(lists)
                 captured_s = None if stated is None else stated.stated_s
                 told = inputs(heard, lists, max_age_s=max_age_s, at=at, captured_s=captured_s)
+                if partial.any():
+                    kept = kept_entries(heard, Sent(lists.start[0], same), partial, schedule, at, max_age_s=max_age_s)
+                    told = with_kept(told, kept, partial, max_age_s)
                 where = f"configurations.{name}.fusion"
                 if fusion.resumable:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
@@ -226,9 +235,14 @@ class Receivers:
                 yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole, stated, faults)
                 continue
             # Later lists of the same captures, as in a sweep of latencies, are fused once.
-            made_of = (of_truth, states, at.newest.tobytes())
+            of_partial = None
+            if partial.any() and not of_truth:
+                of_partial = kept_by_object(heard, partial, schedule, at, max_age_s=max_age_s)
+            known = b"" if of_partial is None else of_partial.entry.tobytes()
+            made_of = (of_truth, states, at.newest.tobytes(), known)
             if last is None or last[0] != made_of:
-                last = made_of, fuse(heard, max_age_s=max_age_s, without_object_ix=world.scene.ego_ix, at=at)
+                ego = world.scene.ego_ix
+                last = made_of, fuse(heard, max_age_s=max_age_s, without_object_ix=ego, at=at, kept=of_partial)
             fused_tracks = last[1].arriving(heard, at.issue_s)
             if not of_truth and world.recorded is None:
                 fused_tracks = replace(fused_tracks, view=world.found.view)
@@ -236,12 +250,13 @@ class Receivers:
                 fused_tracks = draw_posterior(fused_tracks, world.scene, experiment.seed, self._runs)
             yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole, faults=faults)
 
-    def _ghosts(self, world: WorldChunk) -> GhostRows | None:
-        """What units list of nobody, where a block has one run and there is a fusion that would not know better."""
-        if not world.experiment.runs_apart or world.placed is None:
-            return None
-        between_s = world.earliest_s, world.chunk.until_s
-        return ghosts_in(world.scene, world.found, world.experiment, world.placed, int(self._runs[0]), between_s)
+
+def ghosts_of(world: WorldChunk, runs: Int) -> GhostRows | None:
+    """What units list of nobody, where a block has one run and there is a fusion that would not know better."""
+    if not world.experiment.runs_apart or world.placed is None:
+        return None
+    between_s = world.earliest_s, world.chunk.until_s
+    return ghosts_in(world.scene, world.found, world.experiment, world.placed, int(runs[0]), between_s)
 
 
 def receive(world: WorldChunk, runs: Int, there: Bool | None) -> Iterator[tuple[str, ReceiverOutput]]:
@@ -255,31 +270,36 @@ def _faults(world: WorldChunk, seen: Tracks, ghosts: GhostRows | None) -> UnitFa
         return None
     first = len(world.found.tracks.frame_ix)
     rows = np.arange(first, first + (0 if ghosts is None else len(ghosts.words)))
-    return UnitFaults(rows, np.isinf(seen.common_arrives_s))
+    not_made = np.isinf(seen.common_arrives_s)
+    if world.on_air is not None and (sent := world.on_air.sent) is not None:
+        not_made[: len(sent.lists)] &= sent.lists  # what is held back is made
+    return UnitFaults(rows, not_made)
 
 
-def _without_truth(world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None = None) -> ObjectLists:
-    """The units' lists as a real fusion sees them: no truth ids, and in no order that means anything."""
-    found, recorded, experiment = world.found, world.recorded, world.experiment
-    words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]
-    existence = found.existence
-    likely = np.eye(len(CLASSES))[found.view.class_ix]
-    track_id = np.full(len(words), -1)
-    if experiment.runs_apart and experiment.draws_claims:  # else nobody would hear of it
-        of = [claims_of(found, experiment, draws_of(world.scene, found, experiment, runs))]
-        if ghosts is not None:
-            drawn_of_ghosts = ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
-            of.append(claims_of(ghosts.found, experiment, drawn_of_ghosts, ghosts.sort))
-            words = np.concatenate([words, ghosts.words])
-        existence = np.concatenate([claims.existence for claims in of])
-        likely = np.concatenate([claims.class_probability for claims in of])
-        track_id = np.concatenate([claims.track_id for claims in of])
+def _without_truth(
+    world: WorldChunk, seen: Tracks, runs: Int, ghosts: GhostRows | None = None
+) -> tuple[ObjectLists, Int]:
+    """The units' lists as a real fusion sees them: no truth ids, and in no order that means anything.
+
+    And for units whose messages are partial which entries (N,) each takes for one object.
+    """
+    rows, recorded, experiment = claimed_rows(world, runs, ghosts), world.recorded, world.experiment
+    words, same = rows.words, rows.same
+    claims = Claims(rows.claims.existence, rows.claims.class_probability, rows.claims.track_id)
     if recorded is not None:
         words = np.concatenate([words, np.arange(len(recorded.existence), dtype=np.uint64)])
-        existence = np.concatenate([existence, recorded.existence])
-        likely = np.concatenate([likely, recorded.class_probability])
-        track_id = np.concatenate([track_id, recorded.track_id])
+        same = np.concatenate([same, words[len(same) :]])
+        claims = Claims(
+            np.concatenate([claims.existence, recorded.existence]),
+            np.concatenate([claims.class_probability, recorded.class_probability]),
+            np.concatenate([claims.track_id, recorded.track_id]),
+        )
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
-    drawn = CounterRng(world.experiment.seed, world.scene.log).uniform("order in the list", random_key, runs)
-    claims = Claims(existence, likely, track_id)
-    return lists_without_truth(seen, claims, drawn, without_object_ix=world.scene.ego_ix)
+    drawn = CounterRng(experiment.seed, world.scene.log).uniform("order in the list", random_key, runs)
+    ego = world.scene.ego_ix
+    lists = lists_without_truth(seen, claims, drawn, without_object_ix=ego)
+    if not experiment.partial:
+        return lists, np.empty(0, dtype=np.int64)
+    picked = listed_rows(seen, drawn, without_object_ix=ego)[1]
+    of = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
+    return lists, np.unique(of, axis=1, return_inverse=True)[1].ravel()

@@ -154,7 +154,7 @@ def told_in(plan: Experiment, log: Recording, runs: Sequence[int] = (0,)) -> tup
     """What the units list with truth ids, and without."""
     world = world_of(plan, log)
     seen = seen_by_all(world, np.array(runs), states="sampled")
-    return seen, _without_truth(world, seen, np.array(runs))
+    return seen, _without_truth(world, seen, np.array(runs))[0]
 
 
 def as_sets(lists: ObjectLists, run: int = 0) -> list[Counter[bytes]]:

@@ -104,7 +104,7 @@ class TestWhatDoesNotMatter:
         plan, runs = noisy(), np.arange(3)
         world = prepare(crowd(), plan).world(plan)
         seen = seen_by_all(world, runs, states="sampled")
-        lists = _without_truth(world, seen, runs)
+        lists = _without_truth(world, seen, runs)[0]
         heard = transmit(seen, [UnitLinks("link", ConstantLink(latency_s=latency_s))])
         told = inputs(heard, lists, max_age_s=1.0)
         rng = np.random.default_rng(0)

@@ -10,6 +10,7 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -35,12 +36,22 @@ class Detections:
     first_unit_ix: Int
 
 
-def detect(heard: Tracks, found: Episodes, *, confirm: Confirm, count_earlier: bool, max_age_s: float) -> Detections:
+def detect(
+    heard: Tracks,
+    found: Episodes,
+    *,
+    confirm: Confirm,
+    count_earlier: bool,
+    max_age_s: float,
+    partial: Collection[str] = (),
+) -> Detections:
     """First detection of every episode, from the lists of all units heard (their arrival times are common to all runs).
 
-    `max_age_s` counts from capture, on top of a list's own way to the receiver.
+    `max_age_s` counts from capture, on top of a list's own way to the receiver. `partial`: units whose messages leave
+    objects out, so that a newer one takes nothing from one that it overtook; then one hit confirms.
     """
-    heard = replace(heard, arrives_s=np.where(out_of_sequence(heard), np.inf, heard.arrives_s))
+    whole = np.array([name not in partial for name in heard.units], dtype=bool)[heard.frame_unit_ix]
+    heard = replace(heard, arrives_s=np.where(whole & out_of_sequence(heard), np.inf, heard.arrives_s))
     arrives_s = heard.common_arrives_s[heard.frame_ix]
     captured_s = heard.row_captured_s
     order, bounds = _by_object(heard, found, arrives_s)
