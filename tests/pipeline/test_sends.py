@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -225,13 +224,6 @@ def when_in(recording: Recording, some: Experiment, one: int) -> list[float]:
     tracks = sent(recording, some, one)
     mine = (tracks.row_object_ix == recording.scene.object_number["c0"]) & (tracks.row_unit_ix == 1) & tracks.valid[0]
     return np.round(10 * tracks.row_captured_s[mine], 6).tolist()
-
-
-def test_a_replay_and_a_recording_for_the_viewer_are_written(tmp_path: Path) -> None:
-    car, some = noisy()
-    result = run(some, [car])
-    result.save(tmp_path / "results")
-    assert {path.suffix for path in (tmp_path / "results").rglob("*")} >= {".mcap", ".rrd", ".csv"}
 
 
 def test_refusals() -> None:
