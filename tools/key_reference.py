@@ -90,7 +90,7 @@ class Reference:
         for choice in self._choices(schema):
             if isinstance(data, dict) and choice.get("properties"):
                 kind = choice["properties"].get("kind", {})
-                if kind and data.get("kind", kind.get("default")) != kind.get("const"):
+                if kind and data.get("kind", kind.get("default")) not in kind.get("enum", [kind.get("const")]):
                     continue
                 if data.keys() - choice["properties"].keys():
                     continue

@@ -110,13 +110,13 @@ def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
     hits = measure["confirm"].get("hits", 1) if isinstance(measure.get("confirm"), dict) else 1
     for name, unit in _items(data.get("units")):
         sends = unit.get("sends")
-        if isinstance(hits, int) and hits > 1 and isinstance(sends, dict):
-            if sends.get("kind") == "cpm" or sends.get("max_objects") is not None:
-                yield source.at(
-                    ("measure", "confirm"),
-                    f"the messages of unit {name!r} leave out objects that are still there, so that a miss is no "
-                    "missed capture; confirm with one hit",
-                )
+        leaves_out = isinstance(sends, dict) and (sends.get("kind") == "cpm" or sends.get("max_objects") is not None)
+        if isinstance(hits, int) and hits > 1 and leaves_out:
+            yield source.at(
+                ("measure", "confirm"),
+                f"the messages of unit {name!r} leave out objects that are still there, so that a miss is no "
+                "missed capture; confirm with one hit",
+            )
         if measure.get("exact") is True and sends is not None:
             message = f"unit {name!r} sends by rules (`sends`) that go by what it sent before: that has no closed form"
             yield source.at(("measure", "exact"), message)

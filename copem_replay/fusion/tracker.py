@@ -37,11 +37,11 @@ class Tracker(ListFusion):
     which it is ignored. What a unit last claimed of a track fades with `forget_s`, existence is
     1 − Π(1 − cₙe^(−age/forget)), so that it depends on time and not on the rate of lists; where it is not above `drop`
     a track ends. Ages count from capture (`stale`: from when the list was heard, as if of then), and what a unit
-    captured last is its last word, in whatever order lists come; of units whose messages leave objects out a claim fades
-    only after the receiver's `max_age_s`. A track is published above `publish`, when the
-    captures that support it span `confirm_s`. Of two tracks as close as two entries of one object may be (d² within the
-    median of χ²), which no list held both for `forget_s`, the younger ends. Yaw and height above ground are the newest
-    entry's, size and class probabilities the mean of all.
+    captured last is its last word, in whatever order lists come; of units whose messages leave objects out claims fade
+    only after the receiver's `max_age_s`. A track is published above `publish`, when the captures that support it span
+    `confirm_s`. Of two tracks as close as two entries of one object may be (d² within the median of χ²), which no list
+    held both for `forget_s`, the younger ends. Yaw and height above ground are the newest entry's, size and class
+    probabilities the mean of all.
     `errors_last_s` τ: the position errors of one unit about one object decay as e^(−Δ/τ), so an entry counts as a fresh
     one of R·(1 + φ)/(1 − φ), φ = e^(−Δ/τ) of the time since that unit's last about the track; the first counts fully,
     and an object at rest gets the variance of the best linear estimate. `common_share`: so much of each R may hang
