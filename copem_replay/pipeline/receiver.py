@@ -189,7 +189,7 @@ class Receivers:
         experiment = world.experiment
         seen: dict[States, Tracks] = {}  # each is made when first needed
         without_truth: list[tuple[ObjectLists, Int]] = []
-        partial = np.array([one in experiment.partial for one in experiment.units], dtype=bool)
+        leave_out = set(experiment.partial)
         last: tuple[tuple[bool, States, bytes, bytes], FusedTracks] | None = None
 
         ghosts = ghosts_of(world, self._runs)
@@ -208,6 +208,7 @@ class Receivers:
             heard = listen(seen_in(states), world, name, self._there)
             if name not in self._schedules:
                 self._schedules[name] = fusion_schedule(heard, max_age_s=max_age_s)
+            partial = np.array([unit in leave_out for unit in heard.units], dtype=bool)
             faults = None if of_truth else _faults(world, seen_in(states), None if posterior else ghosts)
             if isinstance(fusion, Ideal) and faults is not None:
                 faults = replace(faults, ghosts=faults.ghosts[:0])  # it knows them for what they are
@@ -236,7 +237,7 @@ class Receivers:
                 continue
             # Later lists of the same captures, as in a sweep of latencies, are fused once.
             of_partial = None
-            if partial.any() and not of_truth:
+            if partial.any():
                 of_partial = kept_by_object(heard, partial, schedule, at, max_age_s=max_age_s)
             known = b"" if of_partial is None else of_partial.entry.tobytes()
             made_of = (of_truth, states, at.newest.tobytes(), known)
