@@ -82,7 +82,9 @@ class Reach:
             # What arrives at an instant, and what else is gone by.
             oldest_s = np.minimum.reduceat(mine.captured_s[at.arrived], at.arrived_start[:-1])
             used_s = np.where(at.newest >= 0, mine.captured_s[at.newest], np.inf).min(axis=1)
-            if partial := set(experiment.partial):  # entries are kept for long after a message that leaves them out
+            if partial := {
+                n for n, of in experiment.modelled.items() if of.sends is not None and of.sends.partial
+            }:  # entries are kept for long after a message that leaves them out
                 of = np.array([unit in partial for unit in mine.units], dtype=bool)[mine.frame_unit_ix]
                 way_s = np.where(of & np.isfinite(mine.common_arrives_s), mine.common_arrives_s - mine.captured_s, 0.0)
                 used_s = np.minimum(used_s, at.issue_s - configuration.max_age_s - way_s.max(initial=0.0))
