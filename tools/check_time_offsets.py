@@ -52,12 +52,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--from", dest="first", type=int, default=0, metavar="SEED", help="the first of the seeds")
     options = parser.parse_args()
+    seeds = range(options.first, options.first + options.seeds)
     print(f"{'recording':<24}{'against':<9}{'told':>6}{'inside':>8}{'rmse_s':>9}{'worst_s':>9}{'half_s':>9}")
     for path in options.recordings:
         recording = read(path, name=path.stem)
         for truth in (False, True):
-            found = [tried(recording, seed, truth=truth) for seed in range(options.seeds)]
+            found = [tried(recording, seed, truth=truth) for seed in seeds]
             told = [(true_s, one) for true_s, one in found if one.untold is None]
             error_s = np.array([one.offset_s - true_s for true_s, one in told])
             inside = sum(one.low_s <= true_s <= one.high_s for true_s, one in told)
