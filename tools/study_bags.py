@@ -21,7 +21,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 import copem_replay as cr
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.io.open import open_log
-from copem_replay.io.write.osi_sensor_data import SensorDataWriter
+from copem_replay.io.write.osi_sensor_data_writer import SensorDataWriter
 from copem_replay.io.write.osi_trace import NANOS_PER_SECOND, OsiTrace, write_osi_trace
 
 CROSSING: Final = Path(__file__).resolve().parents[1] / "logs" / "crossing.mcap"
@@ -159,10 +159,12 @@ def _lists(
     if at_s is not None:
         stamps_ns = np.rint(at_s * NANOS_PER_SECOND).astype(np.int64)
         which = np.searchsorted(made_ns, stamps_ns, side="right") - 1
-    for frame, stamp_ns in zip(which.tolist(), stamps_ns.tolist(), strict=True):
+    lists = list(writer.messages(made_ns))
+    for frame, stamp_ns in zip(which.tolist(), (stamps_ns + ahead_ns).tolist(), strict=True):
         if frame < 0:
             continue
-        message = SensorData.FromString(writer.message(frame, stamp_ns + ahead_ns))
+        message = SensorData.FromString(lists[frame])
+        message.timestamp.seconds, message.timestamp.nanos = divmod(stamp_ns, NANOS_PER_SECOND)
         message.ClearField("last_measurement_time")
         if says_capture:
             captured_ns = int(made_ns[frame]) + ahead_ns
