@@ -4,7 +4,7 @@ interval holds it.
 Two units list the traffic of a recording in log coordinates, each at a rate of its own, with misses and errors of half
 a metre, in a frame of time that is off by −1 … 1 s; or one of them is the truth.
 
-    python tools/check_time_offsets.py --seeds 40 logs/crossing.mcap
+    python tools/check_time_offsets.py --from 40 --seeds 40 logs/crossing.mcap
 """
 
 from __future__ import annotations
