@@ -29,7 +29,8 @@ CROSSING: Final = Path(__file__).resolve().parents[1] / "logs" / "crossing.mcap"
 CLOCK_AHEAD_S: Final = 0.13  # the roadside unit's clock against the vehicle's
 EGO_DELAY_S: Final = 0.07  # the vehicle's lists are stamped when they are sent, and do not say when they were captured
 RSU_DELAY_S: Final = 0.09  # the roadside unit's say both
-STACK_STEP_S: Final = 0.1  # the stack publishes so often; its states are of its stamp
+STACK_STEP_S: Final = 0.1  # the stack publishes so often, the newest list of its tracker
+STACK_AGE_S: Final = 0.025  # whose states are on average so much older: 0.03 s, 0.005 s where the unit's came since
 STACK_LATENCY_S: Final = 0.04  # and are logged so long after it
 RADIO_S: Final = 0.1  # in neither bag: how long the roadside unit's lists take to the vehicle
 

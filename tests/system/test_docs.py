@@ -123,12 +123,18 @@ def test_what_is_put_into_the_bags_is_in_the_intervals_of_the_study(monkeypatch:
     blocks = "".join(re.findall(r"```text\n(.*?)```", page, re.DOTALL))
     told = [tuple(map(float, found)) for found in re.findall(r" ([\d.-]+) s \(95 %: ([\d.-]+) … ([\d.-]+) s", blocks)]
     assert len(told) == 3
-    for true_s, (found_s, low_s, high_s) in zip((put_in.EGO_DELAY_S, 0.0, put_in.CLOCK_AHEAD_S), told, strict=True):
+    true = (put_in.EGO_DELAY_S, put_in.STACK_AGE_S, put_in.CLOCK_AHEAD_S)
+    for true_s, (found_s, low_s, high_s) in zip(true, told, strict=True):
         assert low_s < true_s < high_s
         assert low_s < found_s < high_s
     assert f"{put_in.CLOCK_AHEAD_S:g} s ahead" in page
     assert f"tell of {put_in.EGO_DELAY_S:g} s before" in page
+    assert f"of {put_in.STACK_AGE_S:g} s before" in page
     assert f"takes {put_in.RADIO_S:g} s" in page
+    # By hand, in ms: the stack last heard the vehicle (10 Hz) or the unit (8 Hz from 30 ms), and publishes each 100 ms
+    heard = [*range(70, 60_000, 100), *range(30 + 90 + 100, 60_000, 125)]
+    ages = [min(now - one for one in heard if one <= now) for now in range(1000, 60_000, 100)]
+    assert sum(ages) / len(ages) == pytest.approx(put_in.STACK_AGE_S * 1000, abs=0.1)
 
 
 def test_experiments_on_the_page_load(tmp_path: Path) -> None:
