@@ -31,7 +31,8 @@ DATA: dict[str, Any] = {
     "units": {"ego": {"on": "ego", "pem": "p"}, "mast": {"at": [1, 2], "height_m": 5, "pem": "p", "rate_hz": 5},
               "far": {"at": [9, 9], "height_m": 5, "pem": "other"}},
     "obstacles": [{"polygon_m": [[0, 0], [1, 0], [1, 1]], "height_m": 3}],
-    "configurations": {"mine": {"units": ["mast", "ego"], "latency_s": 0.1}, "another": {"units": ["far"]}},
+    "configurations": {"mine": {"units": ["mast", "ego"], "latency_s": 0.1, "link": "v2x"}, "another": {"units": ["far"]}},
+    "links": {"v2x": {"latency": 0.05, "channel": {"kbps": 600}}, "spare": {"latency": 0.2}},
     "measure": {"onset": {"kind": "in_range", "range_m": 60}, "conflict": {}, "exact": True, "horizon_s": 5},
     "braking": {"driver": {"kind": "constant_deceleration", "a_max_mps2": 8,
                            "reaction": {"kind": "constant", "delay_s": 0.3}}},
@@ -84,7 +85,7 @@ def inner(value: Any, at: str) -> Iterator[tuple[str, Any]]:
             yield from ((where, (*value[:k], changed, *value[k + 1 :])) for where, changed in inner(one, f"{at}.{k}"))
 
 
-OTHERS = ("configurations.another", "units.far", "pems.other")
+OTHERS = ("configurations.another", "units.far", "pems.other", "links.spare")
 UNTOUCHED = {"logs", "runs", "show", "sweep", "measure.horizon_s", "measure.exact", "measure.metrics"}
 
 
@@ -101,6 +102,8 @@ def test_every_key_changes_the_piece_or_is_said_not_to() -> None:
             assert key(experiment(configurations={"mine": of})) != base
             changed, base_of = (experiment(configurations={"mine": of | more}) for more in ({"inputs": ["ego"]}, {}))
             assert key(changed) != key(base_of)
+        elif path == "configurations.mine.link":
+            changed = experiment(configurations={"mine": DATA["configurations"]["mine"] | {"link": "spare"}})
         elif path.endswith(".pem"):
             changed = experiment(units=DATA["units"] | {path.split(".")[1]: DATA["units"]["far"]})
         elif path == "measure.distance_to":
