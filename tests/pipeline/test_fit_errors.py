@@ -120,6 +120,8 @@ def test_what_is_written_is_what_is_replayed() -> None:
     assert model.covariance_m2[0][0] == pytest.approx(fit.bins[0].covariance_m2[0].value, rel=1e-3)
     assert model.speed_sigma_mps == 0
     assert fit.untold["speed"] == "the lists have no such field"
+    flat_m = np.array([np.zeros(len(rows.listed)), np.zeros(len(rows.listed)), np.full(len(rows.listed), np.nan)])
+    assert fit_errors(replace(rows, size_m=flat_m), lists).untold["size"] == "the lists have only some of its fields"
     assert fit.yaml_memory["position"][0]["share"] == pytest.approx(fit.shares.drift, abs=1e-3)
 
 

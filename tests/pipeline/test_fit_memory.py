@@ -116,5 +116,7 @@ def test_what_cannot_be_told() -> None:
     assert why_no_memory(always, one) == "no miss in 161 lists"
     assert why_no_memory(~always, one) == "no hit in 161 lists"
     assert why_no_memory(mixed, two) == "2 passes: no correlation time of detection can be told"
+    assert why_no_memory(mixed, one) == "1 pass: no correlation time of detection can be told"
+    assert why_no_memory(~always[:1], one[:1]) == "no hit in 1 list"
     assert why_no_memory(mixed, np.arange(161)) == "161 passes: no correlation time of detection can be told"
     assert why_no_memory(mixed, np.arange(161) // 20) is None

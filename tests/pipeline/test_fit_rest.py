@@ -109,6 +109,7 @@ def test_classes_that_are_never_mistaken() -> None:
     assert fit.keys() == {}
     assert fit.untold is not None
     assert fit.untold.startswith("no class mistaken in")
+    assert 0 < float(fit.untold.partition("< ")[2].partition(",")[0]) < 0.1
 
 
 def test_existence_of_objects_and_of_others() -> None:
@@ -249,7 +250,7 @@ def test_ids_and_what_is_untold() -> None:
     found = fit_rest(replace(rows, track_id=np.cumsum(switch)), lists, nothing_else(), truth="partial")
     assert found.ids_last_s is not None
     assert _holds(found.ids_last_s, 4.0)
-    assert found.untold["ghosts"] == "the truth is partial: entries about nobody may be other traffic"
+    assert found.untold["ghosts"] == "the truth is partial: entries about no true object may be other traffic"
     none = fit_rest(replace(rows, track_id=np.full(len(rows.log), -1)), lists, nothing_else(), truth="complete")
     assert none.untold["tracks"] == "the lists have no track ids"
     assert none.untold["ghosts"].startswith("no ghost in")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from copem_replay.cli.api.study import AnyExperiment, AnyPath, Study, read_study, source_of
 from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.core.text import counted
 from copem_replay.experiment.file import Source
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
@@ -45,7 +46,8 @@ class FittedPem:
 
     def __repr__(self) -> str:
         found = self.found
-        return f"FittedPem({found.unit}, {len(found.logs)} logs, {found.gathered.matched} entries)"
+        matched = counted(found.gathered.matched, "entry", "entries")
+        return f"FittedPem({found.unit}, {counted(len(found.logs), 'log')}, {matched})"
 
     @property
     def estimates(self) -> dict[str, Estimate]:

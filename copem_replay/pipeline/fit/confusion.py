@@ -53,9 +53,9 @@ def fit_classes(rows: FitRows, series: Series) -> ClassesFit:
         return ClassesFit(untold="the lists have no classes")
     true, listed = rows.view.class_ix.astype(np.int64), rows.class_ix
     if (true == listed).all():
-        low = 1 - float(beta.ppf(0.95, 0.5, len(true) + 0.5))
+        high = float(beta.ppf(0.95, 0.5, len(true) + 0.5))
         return ClassesFit(
-            untold=f"no class mistaken in {len(true)} entries (right: > {low:.3g}, were they independent)"
+            untold=f"no class mistaken in {len(true)} entries (mistaken: < {high:.2g}, were they independent)"
         )
     counts = np.zeros((len(CLASSES), len(CLASSES)))
     np.add.at(counts, (true, listed), 1.0)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.pem.condition import Condition
@@ -274,8 +275,7 @@ def _rows_per_effective(rows: FitRows, pass_ix: Int, by: tuple[str, ...], monoto
 
 
 def _notes(rows: FitRows) -> tuple[str, ...]:
-    n = len(rows.listed)
     if rows.listed.all() or not rows.listed.any():
-        what = "miss" if rows.listed.all() else "hit"
-        return (f"no {what} in {n} lists: intervals of detection take lists as independent, which cannot be told",)
+        none = f"no {'miss' if rows.listed.all() else 'hit'} in {counted(len(rows.listed), 'list')}"
+        return (f"{none}: intervals of detection take lists as independent, which cannot be told",)
     return ()

@@ -280,7 +280,8 @@ def _spread(
     there = np.asarray(np.isfinite(values).all(axis=1))
     n, C = int(there.sum()), values.shape[1]
     if n < FEWEST:
-        return None, (), "the lists have no such field" if n == 0 else f"{n} entries have it"
+        none = f"the lists have {'only some of its fields' if np.isfinite(values).any() else 'no such field'}"
+        return None, (), none if n == 0 else f"{n} entries have it"
     sigma = float(np.sqrt((values[there] ** 2).mean()))
     if sigma < 1e-9:
         return None, (), "it is exact"

@@ -1,4 +1,4 @@
-"""Ghosts: entries about nobody, chained from list to list. How many there are, how long they last, and where."""
+"""Ghosts: entries about no true object, chained from list to list. How many, how long they last, and where."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class GhostsFit:
 
 
 def fit_ghosts(rows: FitRows, lists: FitLists, other: OtherEntries) -> GhostsFit:
-    """Fit the entries about nobody; the truth is complete."""
+    """Fit the entries about no true object; the truth is complete."""
     L, E = len(lists.log), len(other.list)
     if L < 2:
         return GhostsFit(untold=f"{L} lists")

@@ -14,6 +14,7 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
+from copem_replay.core.text import counted
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.lasting_survival import Sequences
 from copem_replay.pipeline.fit.choice import FEWEST_PASSES
@@ -59,9 +60,9 @@ def why_no_memory(listed: Bool, pass_ix: Int) -> str | None:
     passes = len(np.unique(pass_ix))
     for what, where in (("miss", ~listed), ("hit", listed)):
         if not where.any():
-            return f"no {what} in {len(listed)} lists"
+            return f"no {what} in {counted(len(listed), 'list')}"
     if passes < FEWEST_PASSES or len(listed) == passes:
-        return f"{passes} passes: no correlation time of detection can be told"
+        return f"{counted(passes, 'pass', 'passes')}: no correlation time of detection can be told"
     return None
 
 

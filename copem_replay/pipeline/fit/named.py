@@ -11,6 +11,9 @@ import numpy as np
 
 from copem_replay.pipeline.fit.estimate import PER_ROW, Estimate
 
+_ROUNDING = 1e-9
+"""Numbers that differ by no more than this share of them are the same, but for the order in which they are summed."""
+
 
 def named_estimates(found: Any, name: str = "") -> Iterator[tuple[str, Estimate]]:
     """`detection.memory.share` and its estimate, and so on, in the order of the fields."""
@@ -37,12 +40,14 @@ def moved_by(main: Any, others: Mapping[float, Any]) -> list[str]:
     held = {gate_m: dict(named_estimates(found)) for gate_m, found in others.items()}
     lines = []
     for name, estimate in named_estimates(main):
+        shown = name.removeprefix("rest.")
         for gate_m, found in held.items():
             other = found.get(name)
             if other is None or other.why is not None or estimate.why is not None or math.isnan(estimate.low):
                 continue
-            if not (math.isnan(other.value) or estimate.low <= other.value <= estimate.high):
-                lines.append(f"{name}: {estimate.words()}, but {other.value:.3g} with a gate of {gate_m:g} m")
+            slack = _ROUNDING * abs(estimate.value)
+            if not (math.isnan(other.value) or estimate.low - slack <= other.value <= estimate.high + slack):
+                lines.append(f"{shown}: {estimate.words()}, but {other.value:.3g} with a gate of {gate_m:g} m")
     return lines
 
 

@@ -59,7 +59,7 @@ def fit_rest(rows: FitRows, lists: FitLists, other: OtherEntries, *, truth: Lite
     placed = fit_pose(listed, lists)
     classes = fit_classes(listed, series)
     existence = fit_existence(listed.existence, listed.pass_ix, other.existence if complete else None)
-    partial = GhostsFit(untold="the truth is partial: entries about nobody may be other traffic")
+    partial = GhostsFit(untold="the truth is partial: entries about no true object may be other traffic")
     ghosts = fit_ghosts(rows, lists, other) if complete else partial
     ids = _ids(listed)
     times = fit_list_times(lists)
