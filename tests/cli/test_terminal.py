@@ -32,7 +32,8 @@ configurations:
   gnn: {units: all, latency_s: {ego: 0, default: 0.3}, fusion: {kind: gnn}}
   a fusion of two units, with a long name: {units: all, latency_s: 1.0, fusion: {kind: gnn}}
 """
-COMMANDS = ("", "info", "init", "check", "run", "compare", "plot", "report", "view", "layout", "schema", "convert")
+COMMANDS = ("", "info", "init", "check", "run", "fit", "compare", "plot", "report", "view", "layout", "schema",
+            "convert")  # fmt: skip
 FORMATS = ("argoverse2", "scenarionet", "openlabel", "commonroad", "sumo", "csv")
 
 
