@@ -179,10 +179,12 @@ def visible_shares(world: Tracks, static: Statics, observers: Observers, model: 
 
     Raises InputError where a model of the user's own fails, or gives no shares.
     """
+    expected = (len(observers.carrier_ix), len(world.frame_ix))
+    if not expected[1]:  # a model is not asked about nothing
+        return np.zeros(expected)
     found = asked(model, "visibility", lambda: np.asarray(model.shares(world, static, observers), dtype=float))
     if not is_own(type(model)):
         return found
-    expected = (len(observers.carrier_ix), len(world.frame_ix))
     if found.shape != expected:
         raise wrong(model, "visibility", f"shares: expected shape {expected}, found {found.shape}", "shares")
     seen = observers.present[:, world.frame_ix] & (world.row_object_ix != observers.carrier_ix[:, None])

@@ -109,7 +109,7 @@ def test_bins_and_frame_are_chosen_where_they_explain_more() -> None:
     near, far = fit.bins
     assert near.where.when == {"range_m": [0.0, 20.0]}
     assert 2 * near.covariance_m2[0].high < far.covariance_m2[0].low
-    assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range", "by range + memory"]
+    assert [rung.name for rung in fit.ladder if rung.chosen] == ["by range + memory"]
     assert len(fit_errors(rows, lists, simplest=True).bins) == 1
 
 

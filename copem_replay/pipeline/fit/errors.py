@@ -179,7 +179,7 @@ def fit_errors(
         frame, tuple(_estimates(one, moments, b) for b, one in enumerate(bins)),
         spreads["yaw"], spreads["speed"], spreads["size"],
         found, memory.shares, _shape(moments.standardised(error_m, bin_ix)), listed, bin_ix,
-        (*ladder, last[1]), frames, untold,
+        (*(rung for rung in ladder if not rung.chosen), *last), frames, untold,
     )  # fmt: skip
 
 
