@@ -32,7 +32,7 @@ def ranks_figure(study: FitStudy) -> Figure:
                           label=label if k == 0 else None)  # fmt: skip
         axes.set_yticks(range(len(names)), names)
         for k, name in enumerate(names):
-            said = study.verdicts.get(name, "")
+            said = study.verdicts.get(name, "") + 4 * "\u00a0"  # a browser's letters may be wider than those measured
             axes.text(1.03, k, said, transform=axes.get_yaxis_transform(), va="center", fontsize=7.5)
         axes.set_ylim(len(names) - 0.45, -0.55)
         axes.set_xlim(-0.02, 1.02)
