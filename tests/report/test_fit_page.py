@@ -123,4 +123,4 @@ def test_a_delay_moves_entries_along_the_way() -> None:
 def test_ranks_are_a_point_each() -> None:
     [axes] = ranks_figure(_study()).axes
     assert [len(line.get_xdata()) for line in axes.lines] == [12, 12]
-    assert [text.get_text() for text in axes.texts] == ["holds"]
+    assert [text.get_text().strip() for text in axes.texts] == ["holds"]
