@@ -19,7 +19,7 @@ try:  # before `main` is there to catch it
 
     import typer
 
-    from copem_replay.cli import convert, fit, inspect, results, run
+    from copem_replay.cli import convert, fit, inspect, results, run, samples
     from copem_replay.cli.terminal import complain
     from copem_replay.core.compiled import cache_note
     from copem_replay.core.errors import CopemError, InputError
@@ -64,6 +64,7 @@ for command in (
     results.view,
     results.layout,
     inspect.schema,
+    samples.samples,
 ):
     app.command()(command)
 app.add_typer(convert.app, name="convert")

@@ -33,7 +33,7 @@ configurations:
   a fusion of two units, with a long name: {units: all, latency_s: 1.0, fusion: {kind: gnn}}
 """
 COMMANDS = ("", "info", "init", "check", "run", "fit", "compare", "plot", "report", "view", "layout", "schema",
-            "convert")  # fmt: skip
+            "samples", "convert")  # fmt: skip
 FORMATS = ("argoverse2", "scenarionet", "openlabel", "commonroad", "sumo", "csv")
 
 

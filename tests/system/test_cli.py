@@ -1180,6 +1180,21 @@ class TestView:
         assert call("view", ".") == (130, "", ["interrupted"])
 
 
+class TestSamples:
+    def test_runs_elsewhere(self, tmp_path: Path, call: Call) -> None:
+        assert call("samples") == (0, "10 files in logs\nnext: copem-replay run logs/tc016d.yaml\n", [])
+        for path in (ROOT / "logs").iterdir():
+            assert (tmp_path / "logs" / path.name).read_bytes() == path.read_bytes()
+        assert call("check", "logs/tc016d.yaml").code == 0
+
+    def test_no_file_is_replaced(self, tmp_path: Path, call: Call) -> None:
+        (tmp_path / "mine").mkdir()
+        (tmp_path / "mine/tc016d.yaml").write_text("mine")
+        said = "mine/tc016d.yaml: expected no such file, found one; samples FOLDER names another folder"
+        assert call("samples", "mine") == (2, "", [said])
+        assert [path.read_text() for path in (tmp_path / "mine").iterdir()] == ["mine"]
+
+
 class TestSchema:
     @pytest.fixture
     def schema(self, call: Call) -> dict[str, Any]:
