@@ -236,6 +236,25 @@ def test_links_within_the_project_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), target
 
 
+def test_components_of_the_adding_page_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "docs/develop/adding.md").read_text(encoding="utf-8")
+    page = ModuleType("page")
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(code, vars(page))
+    monkeypatch.setitem(sys.modules, "page", page)
+    cr.check_latency(page.Uniform(kind="page:Uniform", most_s=0.3))
+    measure = {"onset": {"kind": "page:Fast", "speed_mps": 9}, "metrics": [{"kind": "page:Late", "name": "late_share"}]}
+    summary = cr.run(experiment(measure=measure), [scenes.oncoming_car()]).summary.set_index("configuration")
+    assert summary["late_share"].to_dict() == {"GT": 0.0, "PEM": 1.0}  # 10 m/s from the first frame on, seen at 4 s
+
+
+def test_the_adding_page_names_what_is_there() -> None:
+    text = (ROOT / "docs/develop/adding.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (\d+) ", text, re.MULTILINE) == [str(k) for k in range(1, 11)]
+    for name in re.findall(r"`((?:[a-z]\w*/)+(?:\w+\.py)?)`", text):
+        assert (ROOT / name).exists() or (ROOT / "copem_replay" / name).exists(), name
+
+
 def test_architecture_names_every_file() -> None:
     text = (ROOT / "docs/develop/architecture.md").read_text(encoding="utf-8")
     for path in (ROOT / "copem_replay").rglob("*.py"):
