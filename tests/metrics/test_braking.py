@@ -27,6 +27,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.braking.blocked import blocked
 from copem_replay.metrics.braking.driver import (
     ConstantDeceleration,
     ConstantReaction,
@@ -1336,6 +1337,21 @@ def test_required_deceleration_for_who_comes_back() -> None:
         found = judge(encounter, ConstantDeceleration(a_max_mps2=a_max), begin_s)
         assert (found.min_distance_m[0] > 0.5) == passes, a_max
         assert found.required_mps2[0] == pytest.approx(100 / 2 / 19.5, rel=1e-2)
+
+
+def test_stretches_that_a_post_beside_the_way_blocks() -> None:
+    """A car of 4 m × 2 m drives along x; a post of 1 m × 1 m, turned by 30°, stands beside its way."""
+    path, size, post = np.array([[0.0, 0, 0, 0], [60.0, 60, 0, 0]]), np.array([4.0, 2.0]), np.array([1.0, 1.0])
+    for y, blocks in ((1.9, True), (-2.0, True), (2.8, False)):
+        other, stretch_m = np.array([[20.0], [y], [np.pi / 6]]), np.empty((2, 2, 1))
+        blocked(path, size, other, post, 0.5, 0.0, np.array([60.0]), stretch_m)
+        tried_m = np.arange(14.0, 26.0, 1e-3)
+        left_m = [in_shapely((s, 0.0, 0.0, 4.0, 2.0), (20.0, y, np.pi / 6, 1.0, 1.0)) - 0.5 for s in tried_m]
+        within_m = tried_m[np.array(left_m) <= 0]
+        assert bool(len(within_m)) == blocks
+        if blocks:
+            assert stretch_m[0, :, 0] == pytest.approx([within_m[0], within_m[-1]], abs=2e-3)
+        assert np.isinf(stretch_m[int(blocks) :]).all()
 
 
 def test_probability_to_pass_without_delay_at_the_onset() -> None:
