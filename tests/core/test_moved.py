@@ -1,13 +1,14 @@
 """Old import paths answer with the new ones."""
 
 import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import copem_replay as cr
-from copem_replay.core.moved import MOVED
+from copem_replay.core.moved import MOVED, put_up_signposts
 from tests.helpers.experiments import changed, drive
 
 
@@ -22,6 +23,12 @@ def test_every_new_name_is_public(old: str) -> None:
 def test_what_was_in_a_package_is_found_by_the_package() -> None:
     with pytest.raises(ModuleNotFoundError, match=r"^copem_replay\.pem has moved; .*DetectionModel"):
         importlib.import_module("copem_replay.pem.detection")
+
+
+def test_there_is_one_signpost_however_often_it_is_put_up() -> None:
+    before = list(sys.meta_path)
+    put_up_signposts()
+    assert sys.meta_path == before
 
 
 def test_what_never_was_there_is_not_found_as_ever() -> None:

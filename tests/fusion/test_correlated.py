@@ -121,6 +121,13 @@ def test_cross_covariance_of_crossed_ones():
     assert pytest.approx(0.988235 * np.eye(2), abs=1e-6) == P
 
 
+def test_one_position_stays_as_it_is_by_cross_covariance():
+    x, cov = np.array([[3.0, -4.0]]), np.array([[[2.0, 0.5], [0.5, 1.0]]])
+    mean, P = by_cross_covariance(x, cov, 0.4)
+    assert mean.tolist() == [3.0, -4.0]
+    assert P.tolist() == cov[0].tolist()
+
+
 @pytest.mark.parametrize("n", [2, 3, 20])
 def test_equal_circles_by_cross_covariance(n: int):
     # The mean of n unit variances correlated by ρ has (1 + (n − 1)ρ)/n.

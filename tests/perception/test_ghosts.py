@@ -157,6 +157,21 @@ class TestPlaces:
             assert (np.abs(off_m) <= 4 + 3 + 1e-9).all()
             assert (np.abs(tracks.y_m[0]) <= 1.25 + 3 + 1e-9).all()
 
+    def test_beside_what_the_unit_itself_could_list(self) -> None:
+        """Two masts 200 m apart, each with a truck: the ghosts of each are beside its own."""
+        where = {"kind": "beside", "classes": ["truck"], "within_m": 3}
+        masts = {
+            name: {"at": [x_m, 0.0], "height_m": 5.0, "pem": "eyes", "rate_hz": 10.0}
+            for name, x_m in (("west", 0.0), ("zeal", 200.0))
+        }
+        trucks = [Thing(f"truck{x_m:.0f}", "truck", standing(x_m + 30, 0)) for x_m in (0.0, 200.0)]
+        plan = plan_of({"in_list": 1, "lasts_s": 0.3, "where": where}, units=masts)
+        for rows in found(plan, scene_of(*trucks, until_s=5), 4):
+            tracks = rows.found.tracks
+            of_unit = tracks.row_unit_ix
+            assert set(of_unit) == {0, 1}
+            assert (np.abs(tracks.x_m[0] - (30 + 200 * of_unit)) <= 4 + 3 + 1e-9).all()
+
     def test_classes_have_their_sizes(self) -> None:
         shares = {"pedestrian": 0.7, "car": 0.3}
         made = found(plan_of({"in_list": 2, "where": FIELD, "classes": shares}), scene_of(until_s=30), 4)
