@@ -1,10 +1,11 @@
 """Change one thing in a module that makes numbers, and see whether a test fails: 100 times, chosen by seed.
 
-python tools/mutate.py [--mutants 100] [--seed 0] [--from 0] [--only 7] [--out out/mutants.csv]
+python tools/mutate.py [--mutants 100] [--seed 0] [--from 0] [--only 7 12] [--near] [--out out/mutants.csv]
 
 Works on a copy. Of each mutant the tests that import its module come first, then those of its wing, then the others but
-notebooks, docs and browsers. What ends within no reasonable time is killed, too. The test that fails is named.
-Survivors are for a reader: some change nothing that can be told (equivalent), the others want a test.
+notebooks, docs and browsers; `--near`: without these others. What ends within no reasonable time is killed, too. The
+test that fails is named. Survivors are for a reader: some change nothing that can be told (equivalent), the others want
+a test.
 """
 
 from __future__ import annotations
@@ -122,38 +123,55 @@ def chosen(count: int, seed: int) -> list[Mutant]:
     return [rng.choice(module) for module in order[:count]]
 
 
-def killed_by(mutant: Mutant, copy: Path) -> tuple[str, str]:
+def killed_by(mutant: Mutant, copy: Path, *, near: bool) -> tuple[str, str]:
     """Among which tests (`module`, `wing`, `all`) one tells a mutant, and its name; ("", "") where none does."""
     place = copy / mutant.path.relative_to(ROOT)
     kernel = "njit" in mutant.text
+    stale = _compiled_with(mutant, copy) if kernel else []
     env = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "CI": "true"}
-    with tempfile.TemporaryDirectory() as cache:
-        if kernel:  # compiled code of other modules does not notice the change
-            env["NUMBA_CACHE_DIR"] = cache
-        place.write_text(mutant.text, encoding="utf-8")
-        try:
-            for stage, tests in _stages(mutant, copy):
-                command = [
-                    sys.executable,
-                    "-m",
-                    "pytest",
-                    "-x",
-                    "-q",
-                    "-n0" if len(tests) < 4 and stage == "module" else "-n2",
-                ]
-                try:
-                    done = subprocess.run(
-                        [*command, "-p", "no:cacheprovider", *tests], cwd=copy, env=env, capture_output=True,
-                        timeout=_LONGEST_S[stage] * (3 if kernel else 1),
-                    )  # fmt: skip
-                except subprocess.TimeoutExpired:
-                    return stage, "no end"
-                if done.returncode not in (0, 5):
-                    failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout.decode(), re.MULTILINE)
-                    return stage, failed[0] if failed else "no test began"
-        finally:
-            shutil.copy2(mutant.path, place)
+    place.write_text(mutant.text, encoding="utf-8")
+    _forget(stale)
+    try:
+        for stage, tests in _stages(mutant, copy):
+            if near and stage == "all":
+                break
+            workers = "-n0" if len(tests) < 4 and stage == "module" else "-n2"
+            command = [sys.executable, "-m", "pytest", "-x", "-q", workers, "-p", "no:cacheprovider", *tests]
+            try:
+                done = subprocess.run(
+                    command, cwd=copy, env=env, capture_output=True, timeout=_LONGEST_S[stage] * (3 if kernel else 1)
+                )
+            except subprocess.TimeoutExpired:
+                return stage, "no end"
+            if done.returncode not in (0, 5):
+                failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout.decode(), re.MULTILINE)
+                return stage, failed[0] if failed else "no test began"
+    finally:
+        shutil.copy2(mutant.path, place)
+        _forget(stale)
     return "", ""
+
+
+def _compiled_with(mutant: Mutant, copy: Path) -> list[Path]:
+    """The modules whose compiled code may hold the mutant's: itself and what imports it, however far away.
+
+    Numba tells a change by the file that a function stands in, and does not notice one in a file it imports.
+    """
+    texts = {path: path.read_text(encoding="utf-8") for path in sorted((copy / "copem_replay").rglob("*.py"))}
+    found = [copy / mutant.path.relative_to(ROOT)]
+    for path in found:
+        name = ".".join(path.relative_to(copy).with_suffix("").parts)
+        imports = re.compile(
+            rf"\b{re.escape(name)} import|from {re.escape(name.rpartition('.')[0])} import .*\b{path.stem}\b"
+        )
+        found += [other for other, text in texts.items() if other not in found and imports.search(text)]
+    return found
+
+
+def _forget(modules: list[Path]) -> None:
+    for path in modules:
+        for cached in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ic]"):
+            cached.unlink()
 
 
 def _stages(mutant: Mutant, copy: Path) -> Iterator[tuple[str, list[str]]]:
@@ -174,11 +192,12 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--from", dest="first", type=int, default=0)
-    parser.add_argument("--only", type=int)
+    parser.add_argument("--only", type=int, nargs="+")
+    parser.add_argument("--near", action="store_true")
     parser.add_argument("--out", type=Path, default=ROOT / "out/mutants.csv")
     given = parser.parse_args()
     mutants = list(enumerate(chosen(given.mutants, given.seed)))[given.first :]
-    mutants = [m for m in mutants if given.only in (None, m[0])]
+    mutants = [m for m in mutants if given.only is None or m[0] in given.only]
     given.out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, given.out.open("a", newline="", encoding="utf-8") as file:
         copy = Path(folder) / "copy"
@@ -186,7 +205,7 @@ def main() -> None:
         write = csv.writer(file)
         killed = 0
         for number, mutant in mutants:
-            stage, test = killed_by(mutant, copy)
+            stage, test = killed_by(mutant, copy, near=given.near)
             killed += bool(stage)
             write.writerow(
                 [number, mutant.path.relative_to(ROOT), mutant.line, mutant.before, mutant.after, stage, test]
