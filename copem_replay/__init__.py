@@ -15,7 +15,6 @@ import importlib as _importlib
 from typing import TYPE_CHECKING
 
 from copem_replay.core.compiled import cache_note as _cache_note
-from copem_replay.core.moved import put_up_signposts as _put_up_signposts
 
 if TYPE_CHECKING:
     from copem_replay.cli.api import plot
@@ -165,7 +164,6 @@ _PLACES = {
 _MODULE = {name: f"{__name__}.{module}" for module, names in _PLACES.items() for name in names.split()}
 
 _cache_note()  # before Numba is imported
-_put_up_signposts()
 
 
 if not TYPE_CHECKING:  # type checkers would take every name to be there
