@@ -203,11 +203,11 @@ def _block(value: Any) -> list[str]:
     lines: list[str] = []
     items = value.items() if isinstance(value, Mapping) else ((None, item) for item in value)
     for key, item in items:
-        name = "-" if key is None else f"{_flow(key)}:"
+        name = "-" if key is None else f"{flow(key)}:"
         if isinstance(item, Noted):
-            lines += [f"{name} {_flow(item.value)}  # {' '.join(item.words.split())}"]
+            lines += [f"{name} {flow(item.value)}  # {' '.join(item.words.split())}"]
         elif not _noted(item):
-            lines += [f"{name} {_flow(item)}"]
+            lines += [f"{name} {flow(item)}"]
         elif key is None:
             first, *rest = _block(item)
             lines += [f"- {first}", *(f"  {line}" for line in rest)]
@@ -223,14 +223,22 @@ def _noted(value: Any) -> bool:
     return isinstance(value, Noted) or (isinstance(value, list | tuple) and any(map(_noted, value)))
 
 
-def _flow(value: Any) -> str:
+def flow(value: Any) -> str:
     """Plain data on one line."""
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_flow(key)}: {_flow(inner)}" for key, inner in value.items()) + "}"
+        return "{" + ", ".join(f"{flow(key)}: {flow(inner)}" for key, inner in value.items()) + "}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_flow, value))}]"
-    plain = isinstance(value, str) and _PLAIN.fullmatch(value) and isinstance(_core(value), str)
-    return str(value) if plain else json.dumps(value, ensure_ascii=False)
+        return f"[{', '.join(map(flow, value))}]"
+    if isinstance(value, str):
+        plain = _PLAIN.fullmatch(value) and isinstance(_core(value), str)
+        return value if plain else f'"{"".join(map(_escaped, value))}"'
+    return json.dumps(value)
+
+
+def _escaped(c: str) -> str:
+    if c in '"\\':
+        return f"\\{c}"
+    return c if c.isprintable() else f"\\U{ord(c):08x}"
 
 
 def without_notes(value: Any) -> Any:

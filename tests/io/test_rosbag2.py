@@ -414,7 +414,7 @@ def test_info_and_init_of_a_folder(bag, monkeypatch, capsys):
     monkeypatch.chdir(bag.parent)
     lines = describe(survey(Path("drive.2026")))
     assert lines[0] == "drive.2026"
-    assert "experiment; with comments: copem-replay init drive.2026 > experiment.yaml" in lines
+    assert "experiment: copem-replay init drive.2026 > experiment.yaml" in lines
     assert run("init", "drive.2026", monkeypatch=monkeypatch) == 0
     Path("begin.yaml").write_text(capsys.readouterr().out)
     assert run("check", "begin.yaml", monkeypatch=monkeypatch) == 0, capsys.readouterr().err

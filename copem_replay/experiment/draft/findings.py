@@ -122,9 +122,8 @@ class Survey:
 
     `readable`: whether a list of true objects could be read; if not, `reason` says why in a line, and `topics` what
     the file holds all the same. `truth` has an entry per topic that could be the truth: one, unless there is a choice
-    to make (then `choice` says so). `damage`: what is wrong with the file. `experiment`: to begin with. `proposals`:
-    where no list is known by name, what could be read by naming fields. `units`: lists of units, where
-    there is no truth to hold them against.
+    to make (then `choice` says so). `damage`: what is wrong with the file. `proposals`: where no list is known by
+    name, what could be read by naming fields. `units`: lists of units, where there is no truth to hold them against.
     """
 
     recording: str
@@ -135,7 +134,6 @@ class Survey:
     topics: list[TopicFound] = field(default_factory=list)
     truth: list[TruthFound] = field(default_factory=list)
     log: str = ""
-    experiment: str | None = None
     proposals: list[ProposalFound] = field(default_factory=list)
     units: list[UnitFound] = field(default_factory=list)
 

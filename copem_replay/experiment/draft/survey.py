@@ -21,7 +21,6 @@ from copem_replay.experiment.draft.findings import (
     TruthFound,
     UnitFound,
 )
-from copem_replay.experiment.draft.template import short
 from copem_replay.io.channel import Channel
 from copem_replay.io.log import Log
 from copem_replay.io.open import name_of, open_log
@@ -74,8 +73,7 @@ def survey(place: Place | str) -> Survey:
     if not truth:
         return replace(found, reason="; ".join(failures))
     damage = next((t.damage for t in truth if t.damage), found.damage)
-    found = replace(found, readable=True, truth=truth, damage=damage)
-    return replace(found, experiment="\n".join(short(found)) + "\n")
+    return replace(found, readable=True, truth=truth, damage=damage)
 
 
 def _topics(log: Log) -> list[TopicFound]:

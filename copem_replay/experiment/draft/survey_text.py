@@ -1,4 +1,4 @@
-"""A survey of a recording in lines of plain text: topics, truth, units, and the experiment to begin with."""
+"""A survey of a recording in lines of plain text: topics, truth, units, and how to begin."""
 
 from __future__ import annotations
 
@@ -33,9 +33,8 @@ def describe(survey: Survey, width: int | None = None) -> list[str]:
     for proposal in survey.proposals:
         lines.append(f"{proposal.topic} may be read as a list of objects, by the names of its fields:")
         lines += [f"  {line}" for line in read_block(proposal)]
-    if survey.experiment:
-        lines.append(f"experiment; with comments: copem-replay init {shlex.quote(survey.log)} > experiment.yaml")
-        lines += [f"  {line}" for line in survey.experiment.splitlines()]
+    if survey.readable:
+        lines.append(f"experiment: copem-replay init {shlex.quote(survey.log)} > experiment.yaml")
     return [printable(line) for line in lines]
 
 

@@ -1,19 +1,14 @@
-"""The experiment that would replay a recording, as text: from what a look at it found, to begin with.
-
-`short` is what `info` ends with; `commented` is what `init` writes.
-"""
+"""The experiment that would replay a recording, as text: from what a look at it found, to begin with."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
+from copem_replay.core.yaml import flow
 from copem_replay.experiment.draft.findings import ProposalFound, Suggestion, Survey, TruthFound, UnitFound
 
-_PLAIN = re.compile(r"(?:[A-Za-z_/]|\.{1,2}/)(?:[A-Za-z0-9_./-]*[A-Za-z0-9_/])?")
-"""Text that means itself, in YAML, without quotes, in a list or out of it."""
 _WORDS = ("null", "true", "false")
 _UNIT = "[[0.5, 0.0], [0.0, 0.5]]"
 _GENERIC = {"objects", "object", "sensordata", "detections", "tracks", "lists", "list", "markers", "data", "msg"}
@@ -25,35 +20,6 @@ _OTHERS = 6  # topics named in a comment (chosen)
 def main_truth(survey: Survey) -> TruthFound:
     """Of the lists of true objects that were read, the one with the most object states."""
     return max(survey.truth, key=lambda truth: truth.states)
-
-
-def short(survey: Survey) -> list[str]:
-    """The experiment in as few lines as show its parts."""
-    truth = main_truth(survey)
-    guess = truth.suggested
-    ego = guess.ego != "none"
-    recorded = [one for one in _recorded(truth)[0] if not (ego and _of_ego(one[0]))][:1]
-    masts = [] if ego and recorded else guess.masts[:1]
-    lines = ["version: 1", f"logs: [{quoted(survey.log)}]"]
-    lines += [f"read: {{topic: {quoted(truth.topic)}}}"] if survey.choice else []
-    lines += [f"ego: {_ego_value(guess.ego)}"] if guess.ego is not None else []
-    error = "error: {kind: gaussian, covariance_m2: [[1.0, 0.0], [0.0, 1.0]]}"
-    lines += [f"pems: {{eyes: [{{detection: {{kind: visible_share}}, {error}}}]}}", "units:"]
-    lines += ["  ego: {on: ego, pem: eyes}"] if ego else []
-    lines += [f"  roadside: {{at: {_list(m.at)}, height_m: 6.0, pem: eyes}}" for m in masts]
-    lines += [f"  {name}: {{recorded: {_recorded_value(unit)}}}" for name, unit in recorded]
-    first = "ego" if ego else "roadside"
-    lines += ["configurations:", "  GT: {units: truth}", f"  PEM: {{units: [{first}]}}"]
-    if recorded:
-        name = recorded[0][0]
-        units = f"[ego, {name}]" if ego else f"[{name}]"
-        lines.append(f"  {'coPEM' if ego else name}: {{units: {units}}}")
-    elif ego:
-        lines.append("  coPEM: {units: all, latency_s: 0.5}")
-    parts = [f"objects: {{classes: {_list(guess.classes)}}}"] if guess.classes else []
-    parts += ["onset: {kind: appears}"] if guess.onset == "appears" else []
-    parts += [] if ego else ["distance_to: roadside"]
-    return lines + ([f"measure: {{{', '.join(parts)}}}"] if parts else [])
 
 
 def commented(survey: Survey) -> str:
@@ -120,7 +86,7 @@ def read_block(proposal: ProposalFound) -> list[str]:
     read, others = proposal.read, proposal.others
     lines = ["read:   # proposed from the names of its fields: look at each"]
     for key, value in read.items():
-        line = f"  {key}: {_value(value)}"
+        line = f"  {key}: {flow(value)}"
         said = [f"or {_plain(', '.join(others[key][:_OTHERS]))}"] if key in others else []
         said += [_ON_KEYS[key]] if key in _ON_KEYS else []
         lines.append(line + (f"   # {'; '.join(said)}" if said else ""))
@@ -135,12 +101,6 @@ _ON_KEYS = {
     "vx_mps": "along the axes of the frame; `velocity: object`: along the object",
 }
 _NEEDED = dict.fromkeys(("length_m", "width_m"), "a path, or a number that goes for all")
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_value(inner)}" for key, inner in value.items()) + "}"
-    return quoted(str(value))
 
 
 _ONBOARD = [
@@ -205,7 +165,7 @@ def _units(
     else:
         yield "  # Two masts that face each other where most objects come by: x, y in metres as in the log"
     for name, mast in zip(("roadside", "across"), guess.masts[: 1 if ego else 2], strict=False):
-        yield f"  {name}: {{at: {_list(mast.at)}, yaw_deg: {mast.yaw_deg}, height_m: 6.0, pem: roadside}}"
+        yield f"  {name}: {{at: {flow(mast.at)}, yaw_deg: {mast.yaw_deg}, height_m: 6.0, pem: roadside}}"
     if ego:
         yield "  # others: {on: {classes: [car, truck], penetration_rate: 0.3}, pem: onboard}   # 30 % of them (V2V)"
     if recorded:
@@ -260,7 +220,7 @@ def _measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
     yield "measure:"
     if guess.classes:
         said = ", ".join(kinds[name] for name in guess.classes)
-        yield f"  objects: {{classes: {_list(guess.classes)}}}   # {said}; or {{ids: [1, 2]}}; left out: all"
+        yield f"  objects: {{classes: {flow(guess.classes)}}}   # {said}; or {{ids: [1, 2]}}; left out: all"
     else:
         yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
     if guess.onset == "appears":
@@ -297,31 +257,9 @@ def _recorded_value(unit: UnitFound) -> str:
     return f"{{{', '.join(parts)}}}"
 
 
-def _ego_value(ego: str | dict[str, str]) -> str:
-    if isinstance(ego, str):
-        return quoted(ego)
-    return "{" + ", ".join(f"{key}: {quoted(value)}" for key, value in ego.items()) + "}"
-
-
-def _list(values: Sequence[Any]) -> str:
-    return "[" + ", ".join(quoted(v) if isinstance(v, str) else f"{v}" for v in values) + "]"
-
-
 def quoted(text: str) -> str:
-    """Text as YAML has it: in quotes where it would not be read as the same text."""
-    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
-        return text
-    if text.isascii() and text.isdecimal() and str(int(text)) == text:  # ids may be numbers
-        return text
-    return '"' + "".join(_escaped(c) for c in text) + '"'
-
-
-def _escaped(c: str) -> str:
-    if c in '"\\':
-        return f"\\{c}"
-    if c.isprintable():
-        return c
-    return f"\\U{ord(c):08x}"
+    """Text as YAML has it; ids may be numbers."""
+    return text if text.isascii() and text.isdecimal() and str(int(text)) == text else flow(text)
 
 
 def _plain(text: str) -> str:
