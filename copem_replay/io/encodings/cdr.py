@@ -7,7 +7,7 @@ the file says it. Of a message only the fields that are asked for are taken.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -28,8 +28,8 @@ from copem_replay.io.encodings.cdr_program import (
     named,
     picked,
 )
-from copem_replay.io.encodings.columns import Level, Shredded, above, batches, level_of, levels_to
-from copem_replay.io.encodings.raw_values import DefinitionError, RawColumn, joined
+from copem_replay.io.encodings.columns import Definition, Shredded, above, batches, level_of, levels_to
+from copem_replay.io.encodings.raw_values import DefinitionError, RawColumn, joined, shredded
 
 _DEEPEST = kernel.DEEPEST - 1
 _MOST_FIELDS = 20_000
@@ -42,10 +42,11 @@ _EVERYWHERE: dict[str, Any] = {
 """Types that some writers leave out of their definitions, as rosbags has them."""
 
 
-class CdrDefinition:
+class CdrDefinition(Definition):
     """What the messages of a ROS 2 channel look like. Raises DefinitionError."""
 
     def __init__(self, name: str, encoding: str, text: bytes) -> None:
+        super().__init__()
         self._name = name if name.count("/") == 2 else name.replace("/", "/msg/")
         try:
             self._types = {**_EVERYWHERE, **_parsed(text.decode().replace("\r", ""), self._name, encoding)}
@@ -54,19 +55,10 @@ class CdrDefinition:
             raise DefinitionError(f"the definition of {name} cannot be parsed: {why}") from None
         if self._name not in self._types:
             raise DefinitionError(f"the definition of {name} is not among the types its schema defines")
-        self._offers: dict[str, str] = {}
         self._arrays: dict[str, int] = {}  # paths of the arrays of numbers, and how many each has
         self._explored = 0
         self._wide = False  # whether there are wide texts
         self._explore(self._name, "", ())
-
-    def offers(self) -> dict[str, str]:
-        """The paths of all leaves, and what each is: `number`, `text`."""
-        return self._offers
-
-    def names(self, path: str) -> Mapping[int, str]:
-        """ROS 2 has no enumerations."""
-        return {}
 
     def picks(self, path: str) -> bool:
         """Whether a path is of one item of an array of numbers: taken without the others."""
@@ -75,10 +67,7 @@ class CdrDefinition:
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
         """Take messages apart. Raises KeyError for a path that is neither offered nor picked."""
-        wanted = list(dict.fromkeys((*(numbers := tuple(numbers)), *(texts := tuple(texts)))))
-        for path in wanted:
-            if path not in self._offers and not self.picks(path):
-                raise KeyError(path)
+        wanted = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
         order = "be" if payloads and payloads[0][1:2] in (b"\0", b"\6") else "le"
         found = self._walk(payloads, wanted, numbers, texts, f"utf-32-{order}")
         if self._wide and not found.decoded.all():  # writers differ in how wide they are
@@ -115,13 +104,8 @@ class CdrDefinition:
                 column.add(data, b, n)
             rows += found
 
-        made = {name: Level(joined(parents[k], np.int64), {}, {}) for k, name in enumerate(levels)}
-        for path, column in zip(wanted, columns, strict=True):
-            if path in numbers:
-                made[level_of(path)].numbers[path] = column.numbers()
-            if path in texts:
-                made[level_of(path)].texts[path] = column.texts()
-        return Shredded(made, decoded)
+        by_level = {name: joined(parents[k], np.int64) for k, name in enumerate(levels)}
+        return shredded(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
 
     def _explore(self, name: str, path: str, inside: tuple[str, ...]) -> None:
         """Note all leaves below a type. Raises DefinitionError for what has no end, or is too much."""

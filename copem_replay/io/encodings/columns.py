@@ -9,9 +9,9 @@ whoever reads a format works on columns, whatever the messages were encoded in.
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,24 +44,35 @@ class Shredded:
     decoded: Bool  # (F,)
 
 
-class Definition(Protocol):
+class Definition(ABC):
     """What messages of one channel look like. Made from the schema inside the recording."""
+
+    def __init__(self) -> None:
+        self._offers: dict[str, str] = {}
 
     def offers(self) -> dict[str, str]:
         """The paths of all leaves, and what each is: `number`, `text`."""
-        ...
+        return self._offers
 
     def names(self, path: str) -> Mapping[int, str]:
         """The names of the numbers of an enumeration, empty for what is none."""
-        ...
+        return {}
 
     def picks(self, path: str) -> bool:
         """Whether `shred` takes this path, with an item chosen in it, as it is."""
-        ...
+        return False
 
+    @abstractmethod
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
         """Take messages apart. Raises KeyError for a path that is neither offered nor picked."""
-        ...
+
+    def _known(self, paths: Iterable[str]) -> list[str]:
+        """Each path once. Raises KeyError."""
+        wanted = list(dict.fromkeys(paths))
+        for path in wanted:
+            if path not in self._offers and not self.picks(path):
+                raise KeyError(path)
+        return wanted
 
 
 def take_apart(

@@ -13,7 +13,7 @@ import numpy as np
 import orjson
 
 from copem_replay.core.tracks import Float, Int
-from copem_replay.io.encodings.columns import Level, Shredded, Texts, as_text, batches, level_of, levels_to
+from copem_replay.io.encodings.columns import Definition, Level, Shredded, Texts, as_text, batches, level_of, levels_to
 from copem_replay.io.encodings.raw_values import joined
 
 _DEEPEST = 12
@@ -34,11 +34,11 @@ _UNLIKE = (TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 """What is raised at messages that are not what the others are."""
 
 
-class JsonDefinition:
+class JsonDefinition(Definition):
     """JSON messages, judged by some of them: a schema need not be there, nor be kept to."""
 
     def __init__(self, samples: Sequence[bytes]) -> None:
-        self._offers: dict[str, str] = {}
+        super().__init__()
         self._filled: dict[str, bool] = {}  # of each list, whether a message had something in it
         telling = 0
         later: Sequence[bytes] = ()
@@ -52,24 +52,10 @@ class JsonDefinition:
                 break
             self._look_at(payload)
 
-    def offers(self) -> dict[str, str]:
-        """The paths of all leaves, and what each is: `number`, `text`."""
-        return self._offers
-
-    def names(self, path: str) -> Mapping[int, str]:
-        """JSON has no enumerations."""
-        return {}
-
-    def picks(self, path: str) -> bool:
-        """Whether `shred` takes a path with an item chosen in it: never."""
-        return False
-
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
         """Take messages apart. Raises KeyError for a path that is not offered."""
         numbers, texts = tuple(dict.fromkeys(numbers)), tuple(dict.fromkeys(texts))
-        for path in (*numbers, *texts):
-            if path not in self._offers:
-                raise KeyError(path)
+        self._known((*numbers, *texts))
         table = _Table(numbers, texts)
         decoded = np.zeros(len(payloads), dtype=bool)
         for batch in batches(payloads, _BATCH_BYTES):

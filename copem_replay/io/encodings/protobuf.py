@@ -16,8 +16,8 @@ from google.protobuf.message import DecodeError, EncodeError
 
 from copem_replay.core.tracks import Int
 from copem_replay.io.encodings import protobuf_kernel as kernel
-from copem_replay.io.encodings.columns import Level, Shredded, above, batches, level_of, levels_to
-from copem_replay.io.encodings.raw_values import DefinitionError, Kind, RawColumn, joined
+from copem_replay.io.encodings.columns import Definition, Shredded, above, batches, level_of, levels_to
+from copem_replay.io.encodings.raw_values import DefinitionError, Kind, RawColumn, joined, shredded
 
 _DEEPEST = 12
 """Levels of messages within messages that are offered (chosen: definitions may refer to themselves)."""
@@ -44,12 +44,13 @@ _TYPES = {
 """How each type lies in a message, and how it is read."""
 
 
-class ProtobufDefinition:
+class ProtobufDefinition(Definition):
     """What the messages of a protobuf channel look like. Raises DefinitionError."""
 
     def __init__(self, name: str, schema: Any) -> None:
         from mcap_protobuf.decoder import DecoderFactory
 
+        super().__init__()
         try:
             decoder = DecoderFactory().decoder_for("protobuf", schema)
             if decoder is None:
@@ -62,29 +63,17 @@ class ProtobufDefinition:
             raise DefinitionError(f"the definition of {name} cannot be used: {why}") from None
         self._parse = type(empty).FromString
         self._root = empty.DESCRIPTOR
-        self._offers: dict[str, str] = {}
         self._names: dict[str, Mapping[int, str]] = {}
         self._explore(empty.DESCRIPTOR)
-
-    def offers(self) -> dict[str, str]:
-        """The paths of all leaves, and what each is: `number`, `text`."""
-        return self._offers
 
     def names(self, path: str) -> Mapping[int, str]:
         """The names of the numbers of an enumeration, empty for what is none."""
         return self._names.get(path, {})
 
-    def picks(self, path: str) -> bool:
-        """Whether `shred` takes a path with an item chosen in it: never."""
-        return False
-
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
         """Take messages apart. Raises KeyError for a path that is not offered."""
         numbers, texts = tuple(numbers), tuple(texts)
-        wanted = list(dict.fromkeys((*numbers, *texts)))
-        for path in wanted:
-            if path not in self._offers:
-                raise KeyError(path)
+        wanted = self._known((*numbers, *texts))
         levels = levels_to(wanted)
         table = _Table(self._root, wanted, levels)
         columns = [RawColumn(table.kinds[path]) for path in wanted]
@@ -106,13 +95,8 @@ class ProtobufDefinition:
                 column.add(data, bits, lengths, said)
             rows += found
 
-        made = {name: Level(joined(parents[k], np.int64), {}, {}) for k, name in enumerate(levels)}
-        for path, column in zip(wanted, columns, strict=True):
-            if path in numbers:
-                made[level_of(path)].numbers[path] = column.numbers()
-            if path in texts:
-                made[level_of(path)].texts[path] = column.texts()
-        return Shredded(made, decoded)
+        by_level = {name: joined(parents[k], np.int64) for k, name in enumerate(levels)}
+        return shredded(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
 
     def _canonical(self, payload: bytes) -> bytes | None:
         """A message with every field once and as its schema has it, None for what is none."""

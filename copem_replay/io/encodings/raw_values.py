@@ -5,14 +5,14 @@ What compiled walks through CDR and protobuf take; they know no types.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.io.encodings.columns import Texts, as_text
+from copem_replay.io.encodings.columns import Level, Shredded, Texts, as_text, level_of
 
 
 class DefinitionError(ValueError):
@@ -90,6 +90,23 @@ class RawColumn:
         if self._kind.how == "bool":
             return "true" if value else "false"
         return self._kind.names.get(value) or as_text(value)
+
+
+def shredded(
+    parents: Mapping[str, Int],
+    columns: Mapping[str, RawColumn],
+    numbers: Collection[str],
+    texts: Collection[str],
+    decoded: Bool,
+) -> Shredded:
+    """Columns by path, put into the levels they are of, by whose names `parents` are."""
+    made = {name: Level(parent, {}, {}) for name, parent in parents.items()}
+    for path, column in columns.items():
+        if path in numbers:
+            made[level_of(path)].numbers[path] = column.numbers()
+        if path in texts:
+            made[level_of(path)].texts[path] = column.texts()
+    return Shredded(made, decoded)
 
 
 def joined(parts: Sequence[Any], kind: Any) -> Any:
