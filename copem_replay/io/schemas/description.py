@@ -97,30 +97,13 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class Life:
-    """Where messages say that a thing of an earlier one is gone: paths from the message down, None: it is not said."""
-
-    id: str
-    stamp: tuple[str, ...] = ()
-    lifetime: tuple[str, ...] = ()
-    deletion: str | None = None
-    """What is deleted: `all`, or what has an id."""
-    deleted_id: str | None = None
-    all: tuple[str, ...] = ()
-
-    def paths(self) -> list[str]:
-        """All of them."""
-        return [p for p in (self.id, *self.stamp, *self.lifetime, self.deletion, self.deleted_id) if p is not None]
-
-
-@dataclass(frozen=True)
 class Description:
     """A format: its fields, which objects are meant (by values of `only`), and what an id is unique `within`.
 
     `said`: where an object says whether it says its `yaw`, `velocity`, `covariance`: a number, 0 where it does not.
     `footprint`: the points of its outline, with x and y along its axes, where it has no length and width. `solid`:
-    where its shape is said. `largest_of`: the list of things that may have several bodies; the largest counts. `life`:
-    where it is said how long things are there.
+    where its shape is said. `largest_of`: the list of things that may have several bodies; the largest counts. `stays`:
+    the ids of things that are there until it is said otherwise.
     """
 
     fields: Fields
@@ -130,4 +113,4 @@ class Description:
     footprint: str | None = None
     solid: Solid | None = None
     largest_of: str | None = None
-    life: Life | None = None
+    stays: str | None = None

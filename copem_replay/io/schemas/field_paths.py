@@ -101,8 +101,8 @@ class Wanted:
         if described.solid is not None:
             numbers += [self._of_object("length_m", described.solid.kind)]
             numbers += [self._of_object("length_m", f"{described.solid.dimensions}[{k}]") for k in range(2)]
-        if described.life is not None:
-            texts += described.life.paths()
+        if described.stays is not None:
+            texts.append(described.stays)
         texts += self.stamp
         return numbers, texts
 

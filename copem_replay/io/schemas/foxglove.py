@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from copem_replay.io.schemas.description import Class, Description, Fields, Life, Yaw
-from copem_replay.io.schemas.timestamps import stamps_in
+from copem_replay.io.schemas.description import Class, Description, Fields, Yaw
 
 _KEYS = ("class", "category", "category_name", "classification", "label", "object_class", "type")
 
@@ -36,17 +35,5 @@ def description(offers: Collection[str]) -> Description:
             }
         ),
         largest_of="entities[]",
-        life=_life(offers) if "entities[].id" in offers else None,
-    )
-
-
-def _life(offers: Collection[str]) -> Life:
-    """An entity stays until one of its id replaces it, it is deleted, or its lifetime, if it has one, is over."""
-    return Life(
-        "entities[].id",
-        tuple(stamps_in(offers, "entities[].timestamp")),
-        tuple(stamps_in(offers, "entities[].lifetime")),
-        "deletions[].type" if "deletions[].type" in offers else None,
-        "deletions[].id" if "deletions[].id" in offers else None,
-        ("ALL", "1"),
+        stays="entities[].id" if "entities[].id" in offers else None,
     )

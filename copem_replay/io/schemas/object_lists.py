@@ -29,7 +29,6 @@ from copem_replay.io.encodings.columns import (
 from copem_replay.io.schemas.decoded import DecodedObjects
 from copem_replay.io.schemas.description import Amount, Class, Description, Fields, Stamp, Yaw
 from copem_replay.io.schemas.field_paths import FieldsError, Wanted
-from copem_replay.io.schemas.lifetime import life_notes
 from copem_replay.io.schemas.shapes import largest, outlined, rounded
 from copem_replay.io.schemas.timestamps import nanoseconds
 
@@ -267,6 +266,15 @@ class _Reader:
         covariance[~self._said("covariance")[keep]] = np.nan
         return covariance
 
+    def _unsaid(self) -> int:
+        """How many messages between the first and the last with a thing that stays do not repeat it."""
+        if (path := self._description.stays) is None:
+            return 0
+        level = level_of(path)
+        code, message = self._found.levels[level].texts[path].code, rows_above(self._found, level, "")
+        code, message = np.unique(np.stack([code, message])[:, code >= 0], axis=1)
+        return int((np.diff(message) - 1)[np.diff(code) == 0].sum())
+
     def listed(self, log_time_ns: Int) -> DecodedLists:
         """All columns of the objects that are kept. Notes stand in the order in which things are found out."""
         found, meant = self._found, self._meant()
@@ -282,8 +290,10 @@ class _Reader:
         message = found.levels[""].parent[rows_above(found, self._fields.objects, "")]
         kept_message = np.flatnonzero(found.decoded)
         probability = self._classes()[keep]
-        life = self._description.life
-        gone = () if life is None else life_notes(found, life, stamp_ns, stamped)
+        if unsaid := self._unsaid():
+            self._notes[
+                "state", "in between that no message repeats: not taken, a list holds what its message says"
+            ] += unsaid
         columns = DecodedObjects(
             stamp_ns=stamp_ns[kept_message],
             stamped=stamped[kept_message],
@@ -293,7 +303,7 @@ class _Reader:
             object_ix=number.astype(np.int64),
             class_ix=probability.argmax(axis=1).astype(np.int8),
             values=values[keep],
-            notes=(*(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()), *gone),
+            notes=tuple(f"{counted(n, noun)} {what}" for (noun, what), n in self._notes.items()),
         )
         frame, frames = self._frame_of()
         return DecodedLists(
