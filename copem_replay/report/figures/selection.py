@@ -44,7 +44,7 @@ def choose(
     run: int | None = None,
 ) -> Choice:
     """What was asked for; by default the object that tells most (`most_telling`) and the run that is in the .rrd, else
-    the first; of an object in conflict four configurations from worst to best, else up to twelve that differ.
+    the first; four configurations from worst to best.
 
     Raises InputError for what is not among the results.
     """
@@ -63,10 +63,7 @@ def choose(
     log, object_id = most_telling(of_run, truths(results))
     rows = rows[(rows["log"] == log) & (rows["object_id"] == object_id)]
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
-    shown = named
-    if not configurations:
-        judged = "conflict" in rows and bool(rows["conflict"].any())
-        shown = worst_to_best(rows, named) if judged else that_differ(results, named)
+    shown = named if configurations else worst_to_best(rows, named)
     return Choice(log, object_id, run, shown, bool(configurations))
 
 

@@ -16,7 +16,6 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import BY_EGO, share_curves
 from copem_replay.report.figures.captions import list_rates, short_names
 from copem_replay.report.figures.label_layout import STEP_IN, draw_labels, last_instant, mark
-from copem_replay.report.figures.one_object import draw_one_column
 from copem_replay.report.figures.selection import Choice, choose, left_out
 from copem_replay.report.figures.style import FAINT, INK, Appearance, add_note, appearances, new_figure, style
 from copem_replay.report.figures.timeline import Story, row_of, story
@@ -47,16 +46,14 @@ def runs_figure(
 ) -> Figure:
     """Speed of the ego, distance and visible share of one object in one run, a column per configuration.
 
-    Where nothing brakes for the object, one column with a mark per configuration. Raises InputError for what is not
-    among the results, RecordingError where the log is missing or has changed.
+    Raises InputError for what is not among the results, RecordingError where the log is missing or has changed.
     """
     choice = choose(results, configurations=configurations, log=log, object_id=object_id, run=run)
     replay = reread(results, choice.log, choice.object_id)
     rows = [row_of(results.table, choice.log, choice.object_id, choice.run, name) for name in choice.configurations]
     stories = [story(replay, results.experiment, row) for row in rows]
     with style():
-        judged = any(told.encounter is not None for told in stories)
-        figure = _drawn(results, replay, stories) if judged else draw_one_column(results, replay, stories)
+        figure = _drawn(results, replay, stories)
         add_note(figure, _note(results, choice, stories))
     return figure
 

@@ -7,7 +7,7 @@ what is not there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from copem_replay.core.tracks import Float
 from copem_replay.pipeline.receiver import by_truth
 from copem_replay.report.figures.captions import short_names, study
 from copem_replay.report.figures.contenders import contenders
-from copem_replay.report.figures.render import lay_out
-from copem_replay.report.figures.style import INK, add_note, appearances, new_figure, of_configuration, style
+from copem_replay.report.figures.style import add_note, appearances, new_figure, of_configuration, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,14 +25,9 @@ if TYPE_CHECKING:
 
 _ERROR, _FALSE = "position_rmse_m", "false_positives_per_min"
 _WIDE_IN, _HIGH_IN = 8.0, 4.0
-_LABEL_PT = 8.0
-_LETTER_EM = 0.58
-"""Width of a letter, on the average, in sizes of the font (of DejaVu Sans, rounded up)."""
 _FAR = 20.0
 """Largest over smallest rate from which the axis is logarithmic (chosen)."""
 _MARK_PT = 7.0
-_BESIDE_PT = 8.0
-"""From a mark to a name right beside it."""
 
 
 def no_trade_off(results: Results, names: Sequence[str]) -> str | None:
@@ -82,8 +76,7 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
                 f"Not drawn, for they have no such metrics or are the ground truth: {', '.join(left)}" if left else "",
             ],
         )
-        lay_out(figure)  # labels go by where marks lie in the end
-        _labels(axes, [short[name] for name in names], error_m, rate, [list(looks).index(name) for name in names])
+        figure.legend(axes.collections, [short[name] for name in names], loc="outside right upper")
     return figure
 
 
@@ -98,48 +91,3 @@ def _scales(axes: Axes, error_m: Float, rate: Float) -> None:
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     else:
         axes.set_ylim(0.0, 1.12 * rate.max() or 1.0)
-
-
-def _labels(axes: Axes, names: Sequence[str], x: Float, y: Float, numbers: Sequence[int]) -> None:
-    """A name beside each mark where it covers no mark and no other name, with a line to it where that is far."""
-    pt = 72 / axes.get_figure(root=True).dpi  # type: ignore[union-attr]
-    marks = np.asarray(axes.transData.transform(np.stack([x, y], axis=1))) * pt
-    frame = np.asarray(axes.get_window_extent().extents) * pt
-    taken = [(px - 5, py - 5, px + 5, py + 5) for px, py in marks]
-    for name, number, (px, py), here in zip(names, numbers, marks, zip(x, y, strict=True), strict=True):
-        wide, high = len(name) * _LETTER_EM * _LABEL_PT, 1.15 * _LABEL_PT
-        dx, dy, right = _free(px, py, wide, high, taken, frame)
-        left = px + dx - (0 if right else wide)
-        taken.append((left, py + dy - high / 2, left + wide, py + dy + high / 2))
-        far = dy != 0.0 or abs(dx) > _BESIDE_PT
-        arrow: dict[str, Any] = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.6, "shrinkA": 1, "shrinkB": 4}
-        with of_configuration(number, axes):
-            axes.annotate(
-                name, here, xytext=(dx, dy), textcoords="offset points", ha="left" if right else "right",
-                va="center", fontsize=_LABEL_PT, color=INK, arrowprops=arrow if far else None, zorder=4,
-            )  # fmt: skip
-
-
-def _free(
-    px: float, py: float, wide: float, high: float, taken: Sequence[tuple[float, float, float, float]], frame: Float
-) -> tuple[float, float, bool]:
-    """The nearest place (points from the mark) of a label that covers nothing, and whether it goes to the right."""
-    places = [
-        (away, dy, right) for away in (_BESIDE_PT, 20.0, 40.0) for dy in _steps(high, away) for right in (True, False)
-    ]
-    for away, dy, right in sorted(places, key=lambda one: (one[0] + 1.2 * abs(one[1]), not one[2])):
-        left = px + away if right else px - away - wide
-        box = (left, py + dy - high / 2, left + wide, py + dy + high / 2)
-        inside = box[0] >= frame[0] and box[2] <= frame[2] and box[1] >= frame[1] and box[3] <= frame[3]
-        if inside and not any(_meet(box, other) for other in taken):
-            return (away if right else -away), dy, right
-    return _BESIDE_PT, 0.0, True
-
-
-def _steps(high: float, away: float) -> list[float]:
-    most = 1 if away == _BESIDE_PT else 12
-    return [sign * k * high for k in range(most + 1) for sign in (1, -1)]
-
-
-def _meet(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
