@@ -37,7 +37,6 @@ from copem_replay.report.figures import (
     distances_figure,
     latency_breakdown_figure,
     load_results,
-    one_by_one_figure,
     runs_figure,
     sweeps_figure,
     write_figures,
@@ -378,12 +377,16 @@ class TestRuns:
         assert line(columns[2][1], "hits")[1] == pytest.approx([0], abs=1e-6)
 
     def test_without_a_conflict(self, results: Results) -> None:
-        """One course for all, with a mark where each detects: the other stands 30 m aside and nothing brakes."""
+        """The other stands 30 m aside and nothing brakes."""
         figure = runs_figure(results, object_id="3", configurations=["late", "never"])
-        known, speed, gap, share = figure.axes
-        assert [text.get_text() for text in known.get_yticklabels()] == ["late", "never"]
-        assert points(known) == {"late": pytest.approx([0.5])}
-        assert [text.get_text() for text in known.texts] == ["0.5 s", "never known"]
+        late, never = np.array(figure.axes).reshape(3, 2).T
+        speed, gap, share = late
+        titles = [column[0].get_title(loc="left") for column in (late, never)]
+        assert titles == ["late\nknown after 0.5 s, no conflict", "never\nnever known, no conflict"]
+        # Beside each other from 22.75 m on, after 2.275 s; looked for every .05 s.
+        begin, nearest = ("clock starts", 0.0), ("nearest: 28.7 m", 2.3)
+        assert events(speed) == [begin, ("captured", 0.0), ("list arrives", 0.5), nearest]
+        assert events(never[0]) == [begin, nearest, ("log ends", 4.5)]
         # Nearest where the ego passes, 30 − 1 − 0.3 m, 2.5 s after the onset; the log ends after 4.5 s.
         assert at(gap, "as recorded", 2.5) == pytest.approx(28.7)
         x, y = line(speed, "as recorded")
@@ -397,8 +400,8 @@ class TestRuns:
             row for row in text.splitlines() if not row.startswith("  ") or "probab" in row or "on: ego" in row
         )
         figure = runs_figure(load_results(replayed(tmp_path, text)))
-        assert points(figure.axes[0]) == {"GT": pytest.approx([0.0]), "PEM": pytest.approx([0.0])}
-        assert [text.get_text() for text in figure.axes[0].texts] == ["0 s", "0 s"]
+        titles = [axes.get_title(loc="left") for axes in figure.axes[:2]]
+        assert titles == ["PEM\nknown after 0 s", "GT\nknown after 0 s"]
         assert "declared driver" not in note(figure)
 
     def test_labels_have_room(self) -> None:
@@ -644,30 +647,6 @@ class TestSweeps:
     def test_none(self, results: Results) -> None:
         with pytest.raises(InputError, match=r"expected sweep\.csv in it, found none"):
             sweeps_figure(results)
-
-
-class TestOneByOne:
-    def test_a_panel_each_with_the_same_curve_and_its_band(self, results: Results) -> None:
-        together = curves_figure(results).axes[0]
-        figure = one_by_one_figure(results)
-        shown = [axes for axes in figure.axes if axes.get_visible()]
-        names = tuple(results.experiment.configurations)
-        assert [axes.get_title(loc="left").partition(":")[0] for axes in shown] == list(names)
-        for axes, name in zip(shown, names, strict=True):
-            for found, expected in zip(line(axes, name), line(together, name), strict=True):
-                np.testing.assert_array_equal(found, expected)
-            assert line(axes, "first")[1].tolist() == line(together, "GT")[1].tolist()
-        assert [axes.get_xlabel() for axes in shown] == ["", "", *["Time since the onset (s)"] * 3]
-
-    def test_only_where_bands_would_hide_each_other(
-        self, results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr("copem_replay.report.figures.registry.MOST_BANDS", 3)
-        names = ["GT", "late", "near", "hit"]
-        files, _ = write_figures(results, tmp_path / "four", configurations=names)
-        assert "one_by_one.svg" in {path.name for path in files}
-        files, _ = write_figures(results, tmp_path / "three", configurations=names[:3])
-        assert "one_by_one.svg" not in {path.name for path in files}
 
 
 class TestLatencyBreakdown:

@@ -8,7 +8,6 @@
 | `runs_figure` | one run in up to four configurations: speed, distance, visible share, and what happened when |
 | `distances_figure` | distance at detection of every row, a strip per configuration, pass and fail told apart |
 | `curves_figure` | share detected over the time since the onset, with 95 % bands |
-| `one_by_one_figure` | the same, a panel with its band per configuration |
 | `latency_breakdown_figure` | mean duration of the stages from the onset to the detection |
 | `sweeps_figure` | shares and times over what was swept, where the folder has a `sweep.csv` |
 
@@ -19,7 +18,7 @@ imported before a figure is asked for, and pyplot never is.
 from typing import TYPE_CHECKING, Any
 
 from copem_replay.report.figures.answer import answer_figure
-from copem_replay.report.figures.detection_curves import curves_figure, one_by_one_figure
+from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure
 from copem_replay.report.figures.distances import distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
@@ -43,7 +42,6 @@ __all__ = [
     "distances_figure",
     "latency_breakdown_figure",
     "load_results",
-    "one_by_one_figure",
     "runs_figure",
     "sweeps_figure",
     "trade_off_figure",

@@ -20,10 +20,9 @@ from copem_replay.metrics.fixed import NOTHING_DRAWN, fixed_in
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, clusters
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.report.figures.bands import band
-from copem_replay.report.figures.captions import list_rates, percent, short_names, study
+from copem_replay.report.figures.captions import list_rates, short_names, study
 from copem_replay.report.figures.selection import left_out, that_differ
 from copem_replay.report.figures.style import (
-    FAINT,
     Appearance,
     add_note,
     appearances,
@@ -42,10 +41,6 @@ _NEARLY = 0.005
 """The axis ends when each curve has come this near to its last value (chosen)."""
 MOST_BANDS = 6
 """More bands than this hide each other (chosen)."""
-_COLUMNS = 3
-"""Panels side by side where each configuration has one (chosen)."""
-_MOST_PANELS = 24
-"""More panels than this are longer than a page (chosen)."""
 _EXACT: dict[str, Any] = {"color": "black", "linewidth": 0.7, "linestyle": (0, (5, 3))}
 _INSTANTS = 600
 """At which a band is drawn, at most (chosen: a few per pixel's width)."""
@@ -162,50 +157,6 @@ def _drawn(results: Results, curves: dict[str, DetectionCurve], exact: dict[str,
         handlelength=3.6,
     )
     return figure
-
-
-def one_by_one_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
-    """The same curves, each with its band in a panel of its own; thin: that of the first configuration."""
-    every = results.chosen(configurations)
-    names = that_differ(results, every, _MOST_PANELS)
-    over, curves = curves_of(results, names)
-    looks, short = appearances(tuple(results.experiment.configurations)), short_names(names)
-    begin_s, end_s = time_axis(list(curves.values()))
-    rows = math.ceil(len(names) / _COLUMNS)
-    with style():
-        figure = new_figure(8.0, 1.1 + 1.8 * rows)
-        panels = figure.subplots(rows, _COLUMNS, sharex=True, sharey=True, squeeze=False)
-        for axes, name in zip(panels.flat, names, strict=False):
-            with of_configuration(list(looks).index(name), axes):
-                _step(axes, curves[names[0]], begin_s, end_s, label="first", color=FAINT, linewidth=0.9)
-                _band(axes, curves[name], name, looks[name], begin_s, end_s)
-                _step(axes, curves[name], begin_s, end_s, label=name, zorder=2.2, **looks[name].line(1.8))
-            axes.set_title(f"{short[name]}: {percent(curves[name].last)}", loc="left")
-            _axes(axes, begin_s, end_s)
-        for axes in panels.flat[len(names) :]:
-            axes.set_visible(False)
-        for axes in panels.flat[max(len(names) - _COLUMNS, 0) : len(names)]:  # of each column the last
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel("Time since the onset (s)")
-        for axes in panels[:, 0]:
-            axes.set_ylabel("Detected by then")
-        bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
-        said = [study(results, names), f"Thin: {short[names[0]]}", bands if over else "No bands"]
-        _grid(figure, rows, add_note(figure, [*said, left_out(every, names)]))
-    return figure
-
-
-def _grid(figure: Figure, rows: int, note_in: float) -> None:
-    """Panels all alike need no layout that measures every one of them, which takes longer than to draw them."""
-    width_in, height_in = (float(v) for v in figure.get_size_inches())
-    left_in, right_in, top_in, bottom_in, beside_in, between_in = 0.7, 0.1, 0.26, note_in + 0.42, 0.16, 0.34
-    wide_in = (width_in - left_in - right_in - (_COLUMNS - 1) * beside_in) / _COLUMNS
-    high_in = (height_in - top_in - bottom_in - (rows - 1) * between_in) / rows
-    figure.set_layout_engine(None)
-    figure.subplots_adjust(
-        left=left_in / width_in, right=1 - right_in / width_in, top=1 - top_in / height_in,
-        bottom=bottom_in / height_in, wspace=beside_in / wide_in, hspace=between_in / high_in,
-    )  # fmt: skip
 
 
 def _axes(axes: Axes, begin_s: float, end_s: float) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from copem_replay.report.figures.answer import answer_figure
-from copem_replay.report.figures.detection_curves import MOST_BANDS, curves_figure, one_by_one_figure
+from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure, no_differences
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
@@ -67,10 +67,6 @@ def _runs(results: Results, of: Selection) -> Figure:
     from copem_replay.report.figures.single_runs import runs_figure  # with all that replays a run
 
     return runs_figure(results, configurations=of.configurations, log=of.log, object_id=of.object_id, run=of.run)
-
-
-def _few_enough(results: Results, selection: Selection) -> str | None:
-    return "" if len(results.chosen(selection.configurations)) <= MOST_BANDS else None
 
 
 def _no_differences(results: Results, selection: Selection) -> str | None:
@@ -148,12 +144,6 @@ FIGURES: dict[str, FigureKind] = {
         "share detected over the time since the clock started, a line per configuration",
         lambda results, of: curves_figure(results, configurations=of.configurations),
         about=_curves_about,
-    ),
-    "one_by_one": FigureKind(
-        "How soon, one by one",
-        "the same, a panel with its 95 % band per configuration",
-        lambda results, of: one_by_one_figure(results, configurations=of.configurations),
-        missing=_few_enough,
     ),
     "distances": FigureKind(
         "How far away",
