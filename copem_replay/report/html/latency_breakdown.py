@@ -5,21 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from copem_replay.report.figures.captions import plain
-from copem_replay.report.figures.latency_breakdown import HATCHES, STAGES, stages_of
+from copem_replay.report.figures.latency_breakdown import STAGES, stages_of
 from copem_replay.report.html.markup import Html, folded, joined, table, tag
-from copem_replay.report.html.swatches import box
 from copem_replay.report.html.tables import full, named
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import Study
-
-_MARKS = {
-    "": "",
-    "///": "M1 8L8 1M1 14L14 1M7 13L13 7",
-    "...": "M3 4h2M9 4h2M3 10h2M9 10h2",
-    "xxx": "M1 1L13 13M13 1L1 13M1 7L7 13M7 1L13 7M7 1L1 7M13 7L7 13",
-}
-"""Of each hatch what stands for it in a square of 14."""
 
 
 def stage_table(study: Study) -> Html:
@@ -34,14 +25,9 @@ def stage_table(study: Study) -> Html:
         "Rows without detection have no stages, so bars of configurations that miss many objects are over other rows, "
         "and their sum is not the mean time to detection."
     )
-    terms = [part for stage in there for part in (tag("dt", _box(stage), stage), tag("dd", STAGES[stage]))]
+    terms = [part for stage in there for part in (tag("dt", stage), tag("dd", STAGES[stage]))]
     below = folded("What the stages are", tag("dl", *terms))
     return joined([tag("p", about), _table(study, means, there, known), below])
-
-
-def _box(stage: str) -> Html:
-    fill, hatch, ink = HATCHES[stage]
-    return box(fill, _MARKS[hatch], ink)
 
 
 def _table(

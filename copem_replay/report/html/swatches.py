@@ -1,9 +1,8 @@
-"""Pieces of lines and bars for keys and rows of tables, as the figures have them (`report/figures/style.py`)."""
+"""Pieces of lines for keys and rows of tables, as the figures have them (`report/figures/style.py`)."""
 
 from __future__ import annotations
 
 from copem_replay.report.figures.style import Appearance, Colour
-from copem_replay.report.html.greys import as_variables
 from copem_replay.report.html.markup import Html, tag
 
 _PX = 1.25
@@ -36,10 +35,3 @@ def swatch(look: Appearance) -> Html:
 
     edge = [line(look.edge, width + 1.8)] if look.edge != look.colour else []
     return tag("svg", *edge, line(look.colour, width), class_="swatch", viewBox="0 0 44 14", aria_hidden="true")
-
-
-def box(fill: str, marks: str = "", colour: str = "#000000") -> Html:
-    """A piece of a bar, for keys: filled, with `marks` on it, a path in a square of 14. Greys go by the page."""
-    shape = tag("rect", x="0.5", y="0.5", width="13", height="13", fill=fill, stroke="#404040")
-    drawn = [tag("path", d=marks, stroke=colour, stroke_width="1.6", fill="none")] if marks else []
-    return Html(as_variables(tag("svg", shape, *drawn, class_="box", viewBox="0 0 14 14", aria_hidden="true")))
