@@ -24,7 +24,7 @@ from copem_replay.io.recorded_lists import read_listed
 from copem_replay.io.recording import Recording, read
 from copem_replay.io.write.autoware_objects import LABELS
 from copem_replay.io.write.mcap import OSI_RECORD, RUN_RECORD, write_mcap
-from copem_replay.io.write.message_family import family_of
+from copem_replay.io.write.message_family import OSI, family_of
 from copem_replay.pipeline.blocks import replay_block
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
@@ -426,7 +426,7 @@ def test_a_recording_of_osi_gets_messages_of_osi(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "drive.mcap", frames, host=1)
     recording = read(path, name="drive")
     assert (recording.encoding, recording.world) == ("protobuf", "")
-    assert family_of(recording).osi
+    assert family_of(recording).func is OSI  # type: ignore[attr-defined]
 
 
 def scene_updates(path: Path) -> Path:

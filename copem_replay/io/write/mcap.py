@@ -32,12 +32,12 @@ from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write.drawing import TruthScene
 from copem_replay.io.write.message_family import (
+    OSI,
     OSI_CHANNEL,
     TRUTH_TOPICS,
     Family,
     ListWriter,
     Opened,
-    Osi,
     TruthWriter,
     more_topics_of,
     osi_version,
@@ -83,7 +83,6 @@ def write_mcap(
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
     original = source_of(source, window)
-    family = family or Osi()
     rest = iter(run_tracks)
     first = next(rest)  # it tells the configurations and the units
     colours = colours or configuration_colours(first)
@@ -93,7 +92,7 @@ def write_mcap(
         catalogue = Catalogue(writer)
         ours = {topic for name in first for topic in (*topics_of(name), *more_topics_of(name))} | {*TRUTH_TOPICS}
         messages = original.messages(original.register(catalogue, without=ours))
-        opened = family.open(catalogue, scene, numbers)
+        opened = (family or OSI)(catalogue, scene, numbers)
 
         def lists_of(chunk: Mapping[str, FusedTracks]) -> list[Iterator[Message]]:
             return list(_lists_of(opened, scene, chunk, table, colours))
@@ -106,7 +105,7 @@ def write_mcap(
         del first
         chunks = chain([begun], ([*lists_of(c), *besides(c)] for c in rest))
         added = _in_order([chain.from_iterable(_in_order(streams) for streams in chunks), *shown])
-        _add_records(writer, original, family, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
+        _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for message in _made_ahead(_in_order([messages, added])):
             writer.add_message(
                 message.channel_id, message.log_time, message.data, message.publish_time, message.sequence
@@ -116,13 +115,13 @@ def write_mcap(
     return [*([original.damage] if original.damage else []), *notes]
 
 
-def _add_records(writer: Writer, original: Source, family: Family, manifest: Mapping[str, str]) -> None:
+def _add_records(writer: Writer, original: Source, osi: bool, manifest: Mapping[str, str]) -> None:
     """The input's metadata records, and those of this file."""
     for name, record in _kept(original).items():
-        if name != RUN_RECORD and not (family.osi and name == OSI_RECORD):
+        if name != RUN_RECORD and not (osi and name == OSI_RECORD):
             writer.add_metadata(name, record)
     writer.add_metadata(RUN_RECORD, dict(sorted(manifest.items())))
-    if family.osi:
+    if osi:
         writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
 
 

@@ -1,6 +1,6 @@
 """In what messages a replay is written: those of the family its recording is of.
 
-`Osi`: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON; for all recordings but those of ROS 2. `Ros2`: CDR
+OSI: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON; for all recordings but those of ROS 2. ROS 2: CDR
 only, for a file of the profile `ros2` holds nothing else.
 """
 
@@ -66,6 +66,9 @@ class ListWriter(Protocol):
 class Opened(Protocol):
     """A family whose schemas are in the file that is being written."""
 
+    osi: bool
+    """Whether osi3 messages are written."""
+
     def channels(
         self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[detail.Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
@@ -91,21 +94,15 @@ class TruthWriter:
     followed: Callable[[Pose, int, str], bytes]
 
 
-class Family(Protocol):
-    """A family, chosen."""
-
-    osi: bool
-    """Whether osi3 messages are written."""
-
-    def open(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int]) -> Opened:
-        """The schemas put into a file; `units`: the numbers by which units go."""
+Family = Callable[[Catalogue, Scene, Mapping[str, int]], Opened]
+"""Puts the schemas into a file; the last: the numbers by which units go."""
 
 
 def family_of(recording: Recording) -> Family:
     """The family a recording is of, by how the truth is encoded."""
     if recording.encoding == "cdr":
-        return Ros2(recording.world or _NAMELESS)
-    return Osi(recording.world or foxglove.FRAME_ID)
+        return partial(_Ros2, frame_id=recording.world or _NAMELESS)
+    return partial(_Osi, frame_id=recording.world or foxglove.FRAME_ID)
 
 
 def topics_of(configuration: str) -> list[str]:
@@ -129,21 +126,14 @@ def osi_version() -> str:
     return ".".join(map(str, sensor_data.OSI_VERSION))
 
 
-class Osi:
+class _Osi:
     """osi3.SensorData; foxglove.SceneUpdate in the frame of reference `frame_id`; details as JSON."""
 
     osi = True
 
-    def __init__(self, frame_id: str = foxglove.FRAME_ID) -> None:
-        self._frame_id = frame_id
-
-    def open(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int]) -> Opened:
-        """Put the schemas into a file."""
-        return _OpenedOsi(catalogue, scene, units, self._frame_id)
-
-
-class _OpenedOsi:
-    def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str) -> None:
+    def __init__(
+        self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str = foxglove.FRAME_ID
+    ) -> None:
         self._catalogue, self._scene, self._units, self._frame_id = catalogue, scene, units, frame_id
         self._objects = _protobuf(catalogue, sensor_data.message_class(), sensor_data.SCHEMA)
         self._scenes = _protobuf(catalogue, foxglove.message_class(), foxglove.SCHEMA)
@@ -192,23 +182,14 @@ class _OpenedOsi:
         return foxglove.drawn(entities, time_ns, self._frame_id)
 
 
-class Ros2:
+class _Ros2:
     """autoware_perception_msgs/DetectedObjects and foxglove_msgs/SceneUpdate in the frame of reference `frame_id`; the
     JSON of the details as std_msgs/String.
     """
 
     osi = False
 
-    def __init__(self, frame_id: str) -> None:
-        self._frame_id = frame_id
-
-    def open(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int]) -> Opened:
-        """Put the schemas into a file; `units` go by their names."""
-        return _OpenedRos2(catalogue, scene, self._frame_id)
-
-
-class _OpenedRos2:
-    def __init__(self, catalogue: Catalogue, scene: Scene, frame_id: str) -> None:
+    def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str) -> None:
         self._catalogue, self._scene, self._frame_id = catalogue, scene, frame_id
         self._schemas = [
             catalogue.schema(name, "ros2msg", definition(name))
@@ -258,6 +239,10 @@ class _OpenedRos2:
 
     def _channel(self, topic: str, schema: int) -> int:
         return self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
+
+
+OSI: Family = _Osi
+"""The family of all recordings but those of ROS 2."""
 
 
 class _AsStatus:
