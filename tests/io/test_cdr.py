@@ -366,48 +366,9 @@ def test_no_messages() -> None:
     assert texts(found.levels["b[]"].texts["b[].s"]) == []
 
 
-@pytest.mark.parametrize("order", ["le", "be"])
-@pytest.mark.parametrize("codec", ["utf-16", "utf-32"])
-@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
-def test_wide_texts(order: str, codec: str, encoding: str) -> None:
-    """By hand: the number of characters, and two or four bytes each; which, the message does not say."""
-    text = "uint8 a\nwstring b\nwstring<=9 c\nuint16 d\nwstring[] e\nfloat64 f"
-    if encoding == "ros2idl":
-        text = (
-            "module p { module msg { struct A { uint8 a; wstring b; wstring<9> c; uint16 d; "
-            "sequence<wstring> e; double f; }; }; };"
-        )
-    sign = "<" if order == "le" else ">"
-
-    def message(*said: str) -> bytes:
-        out = bytearray(b"\0\1\0\0" if order == "le" else b"\0\0\0\0")
-
-        def put(size: int, data: bytes) -> None:
-            out.extend(bytes(-(len(out) - 4) % size) + data)
-
-        def wide(word: str) -> None:
-            data = word.encode(f"{codec}-{order}")
-            put(4, struct.pack(f"{sign}I", len(data) // (2 if codec == "utf-16" else 4)) + data)
-
-        put(1, b"\7")
-        wide(said[0])
-        wide(said[1])
-        put(2, struct.pack(f"{sign}H", 513))
-        put(4, struct.pack(f"{sign}I", len(said) - 2))
-        for word in said[2:]:
-            wide(word)
-        put(8, struct.pack(f"{sign}d", 0.1))
-        return bytes(out)
-
-    payloads = [message("Fußgänger", "", "a"), message("x", "12.5", "ĀЖ", "日本")]
-    found = take_apart(defined(text, encoding=encoding), payloads, ["a", "c", "d", "f"], ["b", "c", "e[]"])
-    assert found.decoded.all()
-    assert texts(found.levels[""].texts["b"]) == ["Fußgänger", "x"]
-    assert texts(found.levels[""].texts["c"]) == ["", "12.5"]
-    assert texts(found.levels["e[]"].texts["e[]"]) == ["a", "ĀЖ", "日本"]
-    level = found.levels[""].numbers
-    assert (level["a"].tolist(), level["d"].tolist(), level["f"].tolist()) == ([7, 7], [513, 513], [0.1, 0.1])
-    assert level["c"][1] == 12.5
+def test_wide_texts_are_not_read() -> None:
+    with pytest.raises(DefinitionError, match="wstring"):
+        defined("uint8 a\nwstring b")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ the file says it. Of a message only the fields that are asked for are taken.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -57,7 +57,6 @@ class CdrDefinition(Definition):
             raise DefinitionError(f"the definition of {name} is not among the types its schema defines")
         self._arrays: dict[str, int] = {}  # paths of the arrays of numbers, and how many each has
         self._explored = 0
-        self._wide = False  # whether there are wide texts
         self._explore(self._name, "", ())
 
     def picks(self, path: str) -> bool:
@@ -68,24 +67,8 @@ class CdrDefinition(Definition):
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> Shredded:
         """Take messages apart. Raises KeyError for a path that is neither offered nor picked."""
         wanted = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
-        order = "be" if payloads and payloads[0][1:2] in (b"\0", b"\6") else "le"
-        found = self._walk(payloads, wanted, numbers, texts, f"utf-32-{order}")
-        if self._wide and not found.decoded.all():  # writers differ in how wide they are
-            other = self._walk(payloads, wanted, numbers, texts, f"utf-16-{order}")
-            return max(found, other, key=lambda one: int(one.decoded.sum()))
-        return found
-
-    def _walk(
-        self,
-        payloads: Sequence[bytes],
-        wanted: Sequence[str],
-        numbers: Collection[str],
-        texts: Collection[str],
-        wide: str,
-    ) -> Shredded:
-        """Messages taken apart, wide texts as `wide`."""
         levels = levels_to(wanted)
-        builder = Program(self._types, wanted, levels, wide)
+        builder = Program(self._types, wanted, levels)
         builder.add_type(self._name, "")
         program = builder.finished()
         level_ix = np.array([levels.index(level_of(path)) for path in wanted], dtype=np.int64)
@@ -120,8 +103,7 @@ class CdrDefinition(Definition):
             raise DefinitionError(f"the definition of {self._name} has more than {_MOST_FIELDS} fields")
         kind, detail = node
         if kind == BASE:
-            self._offers[path] = "text" if base(detail[0]) in TEXT else "number"
-            self._wide |= detail[0] == "wstring"
+            self._offers[path] = "text" if base(detail[0]) == TEXT else "number"
         elif kind == NAME:
             self._explore(named(detail, self._types, self._name), path, inside)
         else:
@@ -161,8 +143,7 @@ def _parsed(text: str, name: str, encoding: str) -> dict[str, Any]:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     if encoding != "ros2idl":
-        found = get_types_from_msg(_WIDE.sub("wstring", _SEPARATOR.sub("=" * 80, text)), name)
-        return {of: (constants, [(f, _widened(n)) for f, n in fields]) for of, (constants, fields) in found.items()}
+        return get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name)
     if shift := _FAR_SHIFT.search(text):  # rosbags would compute it, gigabytes long
         raise ValueError(f"a constant is shifted by {shift[1]}")
     types: dict[str, Any] = {}
@@ -170,17 +151,6 @@ def _parsed(text: str, name: str, encoding: str) -> dict[str, Any]:
         if part.strip():
             types.update(get_types_from_idl(_NOT_IDL.sub("", part)))
     return types
-
-
-_WIDE = re.compile(r"\bwstring<=[ \t]*\d+")
-
-
-def _widened(node: Any) -> Any:
-    """A node as it is meant: rosbags takes `wstring` for a type of the package."""
-    kind, detail = node
-    if kind == NAME:
-        return (BASE, ("wstring", 0)) if detail.endswith("/wstring") else node
-    return node if kind == BASE else (kind, (_widened(detail[0]), detail[1]))
 
 
 _FAR_SHIFT = re.compile(r"<<[\s(]*(\d{3,})")

@@ -28,7 +28,7 @@ BASES = {
     "float32": (4, "f4"),
     "float64": (8, "f8"),
 }
-TEXT = ("string", "wstring")
+TEXT = "string"
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """rosbags' kinds of node."""
 
@@ -47,19 +47,16 @@ def named(name: str, types: Any, of: str) -> str:
 
 def base(name: str) -> str:
     """The name of a type of values. Raises DefinitionError for one that is not read."""
-    if name not in BASES and name not in TEXT:
+    if name not in BASES and name != TEXT:
         raise DefinitionError(f"values of type {name} are not read by this version")
     return name
 
 
 class Program:
-    """Instructions for a message, with the columns that `wanted` asks for.
+    """Instructions for a message, with the columns that `wanted` asks for."""
 
-    `wide`: the codec of wide texts, of as many bytes per character as its number says.
-    """
-
-    def __init__(self, types: Any, wanted: Sequence[str], levels: Sequence[str], wide: str) -> None:
-        self._types, self._wide = types, wide
+    def __init__(self, types: Any, wanted: Sequence[str], levels: Sequence[str]) -> None:
+        self._types = types
         self._column = {path: k for k, path in enumerate(wanted)}
         self._level = {name: k for k, name in enumerate(levels)}
         self._picked: dict[str, list[int]] = {}
@@ -135,10 +132,9 @@ class Program:
     def _add_base(self, name: str, path: str) -> None:
         column = self._column.get(path, -1)
         level = self._level.get(level_of(path), 0)
-        if name in TEXT:
-            wide = name == "wstring"
-            self._add(kernel.TEXT, column, int(self._wide.split("-")[1]) // 8 if wide else 1, level)
-            self.kinds[path] = Kind(self._wide if wide else "ended")
+        if name == TEXT:
+            self._add(kernel.TEXT, column, 1, level)
+            self.kinds[path] = Kind("ended")
             return
         size, how = BASES[name]
         self.kinds[path] = Kind("bool" if name == "bool" else how)

@@ -24,8 +24,7 @@ class Kind:
     """What the values of a column are.
 
     `how`: how NumPy reads the bits of a number (`f8`), or `bool`, `zigzag` (a signed number as protobuf's sint has it),
-    `text`, `ended` (a text up to the zeros at its end), `bytes`, or the codec of a wide text (`utf-16-le`). `names`: of
-    the numbers of an enumeration.
+    `text`, `ended` (a text up to the zeros at its end), `bytes`. `names`: of the numbers of an enumeration.
     """
 
     how: str
@@ -34,7 +33,7 @@ class Kind:
     @property
     def is_number(self) -> bool:
         """Whether its bits are a number."""
-        return self.how not in ("text", "ended", "bytes") and not self.how.startswith("utf")
+        return self.how not in ("text", "ended", "bytes")
 
 
 class RawColumn:
@@ -134,6 +133,4 @@ def _word(text: bytes, how: str) -> str:
 
 
 def _decoded(text: bytes, how: str) -> str:
-    if how.startswith("utf"):
-        return text.decode(how, errors="replace").rstrip("\0")
     return (text if how == "text" else text.rstrip(b"\0")).decode(errors="replace")
