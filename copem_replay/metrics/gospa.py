@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from copem_replay.core.assignment import assign, assign_pairs
+from copem_replay.core.assignment import assign_pairs
 from copem_replay.core.tracks import Float, Int
 
 
@@ -63,16 +63,13 @@ def gospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> G
 def ospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> float:
     """OSPA between `truth (n, 2)` and `estimates (m, 2)`, metres.
 
-    Of infinite power: the largest distance of a pair, where that is smallest; c where the lists differ in length.
-    Raises ValueError as `gospa` does, but for the infinite power.
+    Raises ValueError as `gospa` does.
 
     Source: Schuhmacher, Vo, Vo, IEEE Trans. Signal Process. 56 (2008) 3447–3457.
 
     >>> cr.ospa(np.array([[0.0, 0.0], [9.0, 0.0]]), np.array([[3.0, 4.0]]), cutoff_m=6.0, power=1)
     5.5
     """
-    if power == math.inf:
-        return _bottleneck(_points("truth", truth), _points("estimates", estimates), _unit(cutoff_m, 1.0))
     result = gospa(truth, estimates, cutoff_m=cutoff_m, power=power)
     n = len(result.partner)
     m = n - result.missed_count + result.false_count
@@ -148,22 +145,6 @@ def _to_the(power: float, squared: float) -> float:
     if power == 2.0:
         return squared
     return float(np.sqrt(squared)) if power == 1.0 else float(squared ** (power / 2))
-
-
-def _bottleneck(x: Float, y: Float, cutoff_m: float) -> float:
-    """The least distance, cut off, within which everybody has a partner; points are `(2, n)` and `(2, m)`."""
-    n, m = x.shape[1], y.shape[1]
-    if n != m or n == 0:
-        return 0.0 if n == m else cutoff_m
-    distance = np.minimum(np.hypot(x[0][:, None] - y[0], x[1][:, None] - y[1]), cutoff_m)
-    partner = np.empty(n, dtype=np.int64)
-    candidates = np.unique(distance)
-    low, high = 0, len(candidates) - 1
-    while low < high:  # the most pairs within a distance: all that are near enough are worth the same
-        middle = (low + high) // 2
-        assign(np.where(distance <= candidates[middle], -1.0, np.inf), partner)
-        low, high = (low, middle) if (partner >= 0).all() else (middle + 1, high)
-    return float(candidates[low])
 
 
 def _points(name: str, points: Float) -> Float:
