@@ -216,18 +216,3 @@ def at_key(key: str, message: str) -> ValidationError:
 def _problem(message: str) -> PydanticCustomError:
     # The message is a constant to pydantic: braces of the text must not be read as fields.
     return PydanticCustomError("component", "{message}", {"message": message})
-
-
-__all__ = [
-    "Component",
-    "Count",
-    "Flag",
-    "Frozen",
-    "Id",
-    "Latency",
-    "NotNegative",
-    "Number",
-    "Positive",
-    "Share",
-    "Slot",
-]

@@ -6,6 +6,7 @@ for.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -21,15 +22,21 @@ from copem_replay.io.encodings.raw_values import DefinitionError
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.messages import gathered
 from copem_replay.io.open import open_log
-from copem_replay.io.recorded_osi import RecordedLists, as_tracks
+from copem_replay.io.recorded_osi import RecordedLists, as_tracks, in_time, read_recorded
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.together import Place
 from copem_replay.io.window import Window
 from copem_replay.io.world_frame import LogContext, in_world, lists_of, log_context
-from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write.ros2_definitions import STRING
+
+
+def lists_on(
+    path: Place, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+) -> RecordedLists:
+    """The lists on `topic` in whatever format, with what their messages say and nothing else. Raises RecordingError."""
+    return read_listed(path, topic, scene, around, window) or read_recorded(path, topic, scene, window)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -69,7 +76,7 @@ def _details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
             continue
         for word in said.levels[""].texts["data"].words:
             try:
-                content = detail.parse(word.encode())
+                content = json.loads(word)
                 found[int(content["available_ns"])] = {**content, "objects": list(content["objects"])}
             except (ValueError, TypeError, KeyError, RecursionError):  # not written by us
                 continue
@@ -112,10 +119,7 @@ def _number(item: Any, name: str, otherwise: float) -> float:
 def _recorded(found: DecodedLists, details: Mapping[int, Mapping[str, Any]], topic: str, scene: Scene) -> RecordedLists:
     found, beside = _with_details(found, details)
     columns = found.columns
-    by_time = np.argsort(columns.stamp_ns, kind="stable")
-    place = np.empty_like(by_time)
-    place[by_time] = np.arange(len(by_time))
-    frame = place[np.repeat(np.arange(len(columns.rows)), columns.rows)]
+    by_time, frame = in_time(columns.stamp_ns, np.repeat(np.arange(len(columns.rows)), columns.rows))
     placed = np.isfinite(columns.values[:, :2]).all(axis=1)
     order = np.flatnonzero(placed)[np.argsort(frame[placed], kind="stable")]
     covariance = found.covariance_m2[order]

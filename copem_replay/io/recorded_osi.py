@@ -7,6 +7,7 @@ this project wrote beside its own lists (`…/detail`) gives the full covariance
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -81,10 +82,7 @@ def read_recorded(path: Place, topic: str, scene: Scene, window: Window | None =
     """The lists on `topic` with all they say, but ids of the truth. Raises RecordingError as `read_lists`."""
     rows, _ = _all_rows(path, topic, window)
     stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
-    by_time = np.argsort(stamps[:, 1], kind="stable")
-    place = np.empty_like(by_time)
-    place[by_time] = np.arange(len(by_time))
-    frame = place[np.array(rows.frame, dtype=np.int64)]
+    by_time, frame = in_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
     values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))
     variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))
     placed = np.isfinite(values[:, :2]).all(axis=1)
@@ -149,7 +147,7 @@ def _read(log: Log, topic: str) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     details: dict[int, dict[str, Any]] = {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
-            content = detail.parse(payload)
+            content = json.loads(payload)
             details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
         else:
             try:
@@ -248,10 +246,7 @@ def _in_world(
 
 def _tracks(rows: _Rows, details: dict[int, dict[str, Any]], topic: str, scene: Scene) -> Tracks:
     stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
-    by_time = np.argsort(stamps[:, 1], kind="stable")
-    place = np.empty_like(by_time)
-    place[by_time] = np.arange(len(by_time))
-    frame = place[np.array(rows.frame, dtype=np.int64)]
+    by_time, frame = in_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
     known = {sensor_data.osi_id(name): k for k, name in enumerate(scene.object_ids)}
     object_ix = np.array([known.get(i, -1) for i in rows.ident], dtype=np.int64)
     track = np.array(rows.track, dtype=np.int64)
@@ -267,6 +262,14 @@ def _tracks(rows: _Rows, details: dict[int, dict[str, Any]], topic: str, scene: 
             variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
     start = np.append(first, len(order))
     return as_tracks(topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances)
+
+
+def in_time(stamps_ns: Int, frame: Int) -> tuple[Int, Int]:
+    """Lists (F,) in order of time, and the places in that order of the lists of rows (P,)."""
+    by_time = np.argsort(stamps_ns, kind="stable")
+    place = np.empty_like(by_time)
+    place[by_time] = np.arange(len(by_time))
+    return by_time, place[frame]
 
 
 def as_tracks(

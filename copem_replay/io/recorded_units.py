@@ -22,8 +22,8 @@ from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, T
 from copem_replay.io.config import Recorded
 from copem_replay.io.list_checks import delay_of, delay_words, odd_about
 from copem_replay.io.plausibility import MAX_GAP_S
-from copem_replay.io.recorded_lists import read_listed
-from copem_replay.io.recorded_osi import RecordedLists, read_recorded
+from copem_replay.io.recorded_lists import lists_on
+from copem_replay.io.recorded_osi import RecordedLists
 from copem_replay.io.recording import Recording
 
 OWN_BODY_M = 0.5
@@ -62,9 +62,7 @@ class RecordedUnits:
 
 def as_recorded(recording: Recording, topic: str) -> RecordedLists:
     """The lists on a topic with what their messages say, and nothing else. Raises RecordingError."""
-    scene, window = recording.scene, recording.window
-    found = read_listed(recording.place, topic, scene, recording.around, window)
-    return found or read_recorded(recording.place, topic, scene, window)
+    return lists_on(recording.place, topic, recording.scene, recording.around, recording.window)
 
 
 def recorded_unit(

@@ -14,8 +14,7 @@ from copem_replay.core.tracks import Scene
 from copem_replay.io.containers.joined import labels_of
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
-from copem_replay.io.recorded_lists import read_listed
-from copem_replay.io.recorded_osi import read_recorded
+from copem_replay.io.recorded_lists import lists_on
 from copem_replay.io.recording import read_log, truth_topics
 from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.short_tracks import Entries, entries_of
@@ -118,8 +117,7 @@ def _lists(log: Log, label: str, t0_ns: int) -> Iterator[_Lists]:
     others = [c.topic for c in known_lists(log.channels) if c.messages and c.topic not in truth_topics(log)]
     for topic in dict.fromkeys([*osis, *others]):
         try:
-            found = None if topic in osis else read_listed(log.path, topic, scene, None)
-            found = found or read_recorded(log.path, topic, scene)
+            found = lists_on(log.path, topic, scene, None)
         except RecordingError:
             continue
         if not topic.startswith(_OURS) and len(found.tracks.frame_ix):

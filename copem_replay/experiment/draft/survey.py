@@ -34,7 +34,6 @@ from copem_replay.io.together import Place, first_of
 if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
     from copem_replay.io.recorded_osi import RecordedLists
     from copem_replay.io.schemas.description import Fields
-    from copem_replay.io.world_frame import LogContext
 
 GATE_M = 3.0
 """Farther from a true object an entry is about no object: the default of `measure.match`."""
@@ -94,12 +93,13 @@ def _topics(log: Log) -> list[TopicFound]:
     return [TopicFound(c.topic, c.schema, c.encoding, c.messages, role(c)) for c in log.channels]
 
 
-def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
+def _units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
     """The lists of each unit, or what is wrong with them: `problem`."""
-    osis = _osi_lists(log)
+    from copem_replay.io.recorded_lists import lists_on
+
     for topic in dict.fromkeys(topics):
         try:
-            found = _lists(recording.place, topic, recording.scene, recording.around, of_osi=topic in osis)
+            found = lists_on(recording.place, topic, recording.scene, recording.around)
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
             continue
@@ -109,11 +109,12 @@ def _units(log: Log, recording: Recording, topics: Sequence[str]) -> Iterator[Un
 def _units_alone(log: Log, place: Place, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
     """The lists of each unit of a recording without truth, as far as they can be read without one."""
     from copem_replay.experiment.draft.clocks import without_objects
+    from copem_replay.io.recorded_lists import lists_on
 
-    osis, scene = _osi_lists(log), without_objects(log.path.stem, log.start_ns, log.end_ns)
+    scene = without_objects(log.path.stem, log.start_ns, log.end_ns)
     for topic in dict.fromkeys(t.topic for t in topics if t.role == "unit" and t.messages):
         try:
-            yield _unit(topic, _lists(place, topic, scene, None, of_osi=topic in osis), {})
+            yield _unit(topic, lists_on(place, topic, scene, None), {})
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(log.path, topic)))
 
@@ -134,10 +135,6 @@ def _unit(topic: str, found: RecordedLists, known: dict[str, Any]) -> UnitFound:
     )
 
 
-def _osi_lists(log: Log) -> set[str]:
-    return {c.topic for c in log.channels if c.schema == osi.SENSOR_DATA}
-
-
 def _against_truth(recording: Recording, found: RecordedLists) -> dict[str, Any]:
     """How late the lists of a unit are, and what is odd about them."""
     from copem_replay.io.list_checks import captured_before, delay_of, delay_words, odd_about
@@ -153,20 +150,6 @@ def _against_truth(recording: Recording, found: RecordedLists) -> dict[str, Any]
     shifted = captured_before(found, scene, delay_s)
     told = with_truth_ids(shifted, scene, truth, gate_m=GATE_M, max_gap_s=MAX_GAP_S)
     return known | {"oddities": list(odd_about(found, told.row_object_ix, scene))}
-
-
-def _lists(place: Place, topic: str, scene: Scene, around: LogContext | None, *, of_osi: bool) -> RecordedLists:
-    """As a recorded unit has them. Raises RecordingError."""
-    if of_osi:
-        from copem_replay.io.recorded_osi import read_recorded
-
-        return read_recorded(place, topic, scene)
-    from copem_replay.io.recorded_lists import read_listed
-
-    found = read_listed(place, topic, scene, around)
-    if found is None:
-        raise RecordingError("holds no list", path=first_of(place), topic=topic)
-    return found
 
 
 def _proposals(log: Log, topics: Sequence[TopicFound]) -> list[ProposalFound]:
@@ -210,7 +193,7 @@ def _truth(log: Log, recording: Recording, topics: Sequence[TopicFound], fields:
         damage=recording.damage,
         notes=list(recording.notes),
         vehicles=moving_ids(scene, shown=6),
-        units=list(_units(log, recording, units)),
+        units=list(_units(recording, units)),
         suggested=suggestion(log, recording, fields),
     )
 

@@ -14,7 +14,6 @@ from copem_replay.io.schemas.description import Class, Description, Fields, Soli
 
 # ObjectClassification.msg of both packages; from HAZARD on it is no road user
 _AUTOWARE = {
-    "0": "other",
     "1": "car",
     "2": "truck",
     "3": "bus",
@@ -23,9 +22,6 @@ _AUTOWARE = {
     "6": "bicycle",
     "7": "pedestrian",
     "8": "animal",
-    "9": "other",
-    "10": "other",
-    "11": "other",
 }
 # autoware_auto_perception_msgs/ObjectClassification.idl is the same up to PEDESTRIAN
 
@@ -37,18 +33,12 @@ _AUTOWARE_SAYS: Mapping[Literal["yaw", "velocity", "covariance"], str] = {
 
 # derived_object_msgs/Object.msg
 _DERIVED = {
-    "0": "other",
-    "1": "other",
-    "2": "other",
-    "3": "other",
     "4": "pedestrian",
     "5": "bicycle",
     "6": "car",
     "7": "truck",
     "8": "motorcycle",
     "9": "vehicle",
-    "10": "other",
-    "11": "other",
 }
 
 

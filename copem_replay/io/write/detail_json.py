@@ -1,8 +1,7 @@
-"""What lies beside a fused list as JSON: its schema, and how it is read; `io/write/detail_json_writer.py` says more."""
+"""What lies beside a fused list as JSON: its schema; `io/write/detail_json_writer.py` says more."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -37,9 +36,3 @@ JSON_SCHEMA = {
         "events": {"type": "array", "items": {"type": "object"}},
     },
 }
-
-
-def parse(payload: bytes) -> dict[str, Any]:
-    """A message as it was written."""
-    content: dict[str, Any] = json.loads(payload)
-    return content
