@@ -95,9 +95,9 @@ def _topics(log: Log) -> list[TopicFound]:
 
 def _units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
     """The lists of each unit, or what is wrong with them: `problem`."""
-    from copem_replay.io.recorded_lists import lists_on
-
     for topic in dict.fromkeys(topics):
+        from copem_replay.io.recorded_lists import lists_on  # it takes time, and most recordings have no lists
+
         try:
             found = lists_on(recording.place, topic, recording.scene, recording.around)
         except RecordingError as error:
