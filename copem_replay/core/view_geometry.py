@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -35,6 +35,11 @@ class ViewGeometry:
     height_m: Float
     yaw_rad: Float
     speed_mps: Float
+
+    @classmethod
+    def joined(cls, views: Sequence[ViewGeometry]) -> ViewGeometry:
+        """Those of several rows one after the other."""
+        return cls(**{f.name: np.concatenate([getattr(view, f.name) for view in views]) for f in fields(cls)})
 
     def take(self, rows: Int) -> ViewGeometry:
         """The view geometry of some rows."""

@@ -166,46 +166,38 @@ class InRange(Onset):
         return f"when it comes within {self.range_m:g} m of {near}"
 
 
-class LineOfSightAny(Onset):
+class _InSight(Onset):
+    visible_share: Annotated[Share, Field(gt=0)] = 0.1
+
+    seen_by: ClassVar[Literal["ego", "any"]]
+
+    def holds(self, view: OnsetView) -> Bool:
+        return view.visible_share(self.seen_by) >= self.visible_share - 1e-9
+
+    def label(self, object_class: str) -> str:
+        return "in sight"
+
+    def described(self, near: str) -> str:
+        who = "any unit" if self.seen_by == "any" else "a unit of the ego"
+        return f"when {who} sees {100 * self.visible_share:g} % of it"
+
+
+class LineOfSightAny(_InSight):
     """Any unit sees at least this share of the object. Units that only some runs have do not count."""
 
     kind: Literal["line_of_sight_any"] = "line_of_sight_any"
-    visible_share: Annotated[Share, Field(gt=0)] = 0.1
 
     requires: ClassVar[Requires] = Requires.UNIT
-
-    def holds(self, view: OnsetView) -> Bool:
-        """(P,) whether enough is seen."""
-        return view.visible_share("any") >= self.visible_share - 1e-9
-
-    def label(self, object_class: str) -> str:
-        """Says it is in sight."""
-        return "in sight"
-
-    def described(self, near: str) -> str:
-        """How much is seen."""
-        return f"when any unit sees {100 * self.visible_share:g} % of it"
+    seen_by: ClassVar[Literal["ego", "any"]] = "any"
 
 
-class LineOfSight(Onset):
+class LineOfSight(_InSight):
     """The ego's units see at least this share of the object."""
 
     kind: Literal["line_of_sight"] = "line_of_sight"
-    visible_share: Annotated[Share, Field(gt=0)] = 0.1
 
     requires: ClassVar[Requires] = Requires.UNIT_ON_EGO
-
-    def holds(self, view: OnsetView) -> Bool:
-        """(P,) whether enough is seen."""
-        return view.visible_share("ego") >= self.visible_share - 1e-9
-
-    def label(self, object_class: str) -> str:
-        """Says it is in sight."""
-        return "in sight"
-
-    def described(self, near: str) -> str:
-        """How much is seen."""
-        return f"when a unit of the ego sees {100 * self.visible_share:g} % of it"
+    seen_by: ClassVar[Literal["ego", "any"]] = "ego"
 
 
 class At(Onset):

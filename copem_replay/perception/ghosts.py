@@ -20,7 +20,7 @@ from copem_replay.core.lasting import ListTimes, births, shared
 from copem_replay.core.random import CounterRng, RandomKey, Words, object_words, stable_hash
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks, class_indices
 from copem_replay.core.view_geometry import ViewGeometry
-from copem_replay.perception.observation import Observations
+from copem_replay.perception.observation import Observations, view_from
 from copem_replay.perception.pem.classes import drawn_class, row_of
 from copem_replay.perception.pem.condition import applies
 from copem_replay.perception.pem.ghosts import Beside, Ghosts
@@ -229,21 +229,8 @@ def _states(
         "width_m": size_m[:, 1],
         "height_m": size_m[:, 2],
     }
-    dx_m, dy_m = values["x_m"] - poses.x_m[at], values["y_m"] - poses.y_m[at]
-    bearing_rad = np.arctan2(dy_m, dx_m)
-    view = ViewGeometry(
-        range_m=np.hypot(dx_m, dy_m),
-        azimuth_rad=wrap(bearing_rad - poses.heading_rad[at]),
-        bearing_rad=bearing_rad,
-        visible_share=np.ones(len(at)),
-        class_ix=class_ix.astype(np.int8),
-        length_m=values["length_m"],
-        width_m=values["width_m"],
-        height_m=values["height_m"],
-        yaw_rad=values["yaw_rad"],
-        speed_mps=values["vx_mps"],
-    )
-    return _as_tracks(true, lists, born, values), view
+    tracks = _as_tracks(true, lists, born, values)
+    return tracks, view_from(tracks, poses, at, np.ones(len(at)), class_ix.astype(np.int8))
 
 
 def _as_tracks(true: Tracks, lists: _Lists, born: _Born, values: dict[str, Float]) -> Tracks:
@@ -278,8 +265,7 @@ def _joined(pieces: Sequence[GhostRows]) -> GhostRows:
     def rows(name: str) -> Float:
         return np.concatenate([getattr(piece.found, name) for piece in pieces])
 
-    names = ViewGeometry.__dataclass_fields__
-    view = ViewGeometry(**{f: np.concatenate([getattr(piece.found.view, f) for piece in pieces]) for f in names})
+    view = ViewGeometry.joined([piece.found.view for piece in pieces])
     couple_ix = np.concatenate([piece.found.couple_ix for piece in pieces])
     found = Observations(tracks, view, couple_ix, rows("probability"), rows("existence"))
     return GhostRows(

@@ -6,15 +6,16 @@ Nothing here depends on the run, on a model's parameters or on a configuration: 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
-from copem_replay.core.tracks import VALUES, Bool, Float, Int, Scene, Tracks, joined, spliced
+from copem_replay.core.tracks import Bool, Float, Int, Scene, Tracks, joined, spliced
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import applies
@@ -111,9 +112,7 @@ def joined_chunks(pieces: Sequence[Observations]) -> Observations:
     def rows(columns: Sequence[Any]) -> Any:
         return np.concatenate(columns)[order]
 
-    view = ViewGeometry(
-        **{f: rows([getattr(piece.view, f) for piece in pieces]) for f in ViewGeometry.__dataclass_fields__}
-    )
+    view = ViewGeometry.joined([piece.view for piece in pieces]).take(order)
     more = (rows([getattr(piece, f) for piece in pieces]) for f in ("couple_ix", "probability", "existence"))
     return Observations(tracks, view, *more)
 
@@ -147,13 +146,9 @@ def observations(
         for k, name in enumerate(names):
             pieces[name] = from_unit(world, places[k], int(carriers[k]), shares[k])
     ordered = [pieces[name] for name in experiment.modelled]
+    nothing = ViewGeometry(*np.empty((len(fields(ViewGeometry)), 0)))
     tracks = joined(tuple(experiment.modelled), [piece[0] for piece in ordered])
-    view = ViewGeometry(
-        **{
-            name: np.concatenate([np.empty(0), *(getattr(piece[1], name) for piece in ordered)])
-            for name in ViewGeometry.__dataclass_fields__
-        }
-    )
+    view = ViewGeometry.joined([nothing, *(piece[1] for piece in ordered)])
     view = replace(view, class_ix=scene.object_class[tracks.row_object_ix])
     return Observations(tracks, view, *_assess(tracks, view, experiment))
 
@@ -184,38 +179,34 @@ def from_unit(world: Tracks, at: UnitPoses, carrier_ix: int, share: Float) -> tu
     """The rows of one unit, all but its carrier, at the lists it exists for, and their view but for the class."""
     keep = at.present[world.frame_ix] & (world.row_object_ix != carrier_ix)
     frames = np.flatnonzero(at.present)
-    frame_number = np.cumsum(at.present) - 1
-    lengths = np.bincount(world.track_ix[keep], minlength=len(world.object_ix))
-    held = lengths > 0
     frame = world.frame_ix[keep]
     tracks = replace(
-        world,
-        start=np.concatenate([[0], np.cumsum(lengths[held])]),
-        unit_ix=world.unit_ix[held],
-        object_ix=world.object_ix[held],
-        frame_ix=frame_number[frame],
+        world.take_rows(np.flatnonzero(keep)),
+        frame_ix=(np.cumsum(at.present) - 1)[frame],
         stamp_ns=world.stamp_ns[frames],
         captured_s=world.captured_s[frames],
         frame_unit_ix=world.frame_unit_ix[frames],
         arrives_s=world.arrives_s[:, frames],
-        valid=world.valid[:, keep],
-        **{name: getattr(world, name)[:, keep] for name in VALUES},
     )
-    dx, dy = tracks.x_m[0] - at.x_m[frame], tracks.y_m[0] - at.y_m[frame]
+    return tracks, view_from(tracks, at, frame, share[keep], np.empty(0, dtype=np.int8))
+
+
+def view_from(tracks: Tracks, at: UnitPoses, pose_ix: Int, share: Float, class_ix: NDArray[np.int8]) -> ViewGeometry:
+    """How rows (P,) look from a unit, each from where it is at one of its poses, `pose_ix` (P,)."""
+    dx, dy = tracks.x_m[0] - at.x_m[pose_ix], tracks.y_m[0] - at.y_m[pose_ix]
     bearing = np.arctan2(dy, dx)
-    view = ViewGeometry(
+    return ViewGeometry(
         range_m=np.hypot(dx, dy),
-        azimuth_rad=wrap(bearing - at.heading_rad[frame]),
+        azimuth_rad=wrap(bearing - at.heading_rad[pose_ix]),
         bearing_rad=bearing,
-        visible_share=share[keep],
-        class_ix=np.empty(0, dtype=np.int8),
+        visible_share=share,
+        class_ix=class_ix,
         length_m=tracks.length_m[0],
         width_m=tracks.width_m[0],
         height_m=tracks.height_m[0],
         yaw_rad=tracks.yaw_rad[0],
         speed_mps=np.hypot(tracks.vx_mps[0], tracks.vy_mps[0]),
     )
-    return tracks, view
 
 
 def _assess(tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup) -> tuple[Int, Float, Float]:

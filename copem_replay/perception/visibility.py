@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
@@ -113,32 +113,38 @@ class VisibilityModel(Component, ABC):
         return f"{self.kind} ({', '.join(f'{key}: {value}' for key, value in said.items())})" if said else self.kind
 
 
-class Surface(VisibilityModel):
+class _BuiltIn(VisibilityModel):
+    """The shares are NaN where the unit is absent or the carrier."""
+
+    flat: ClassVar[bool]
+
+    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
+        order, _bounds = world.by_frame
+        seen, _blocker = _views(world, static, observers, flat=self.flat, blockers=False)
+        shares = np.empty_like(seen)
+        shares[:, order] = seen
+        return shares
+
+    def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
+        order, _bounds = world.by_frame
+        _seen, found = _views(world, static, observers, flat=self.flat, blockers=True)
+        blocker = np.empty_like(found)
+        blocker[:, order] = np.where(found >= 0, order[found], found) if len(order) else found
+        return blocker
+
+
+class Surface(_BuiltIn):
     """The share of the surface that faces the unit, with bodies as high as they are."""
 
     kind: Literal["surface"] = "surface"
-
-    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
-        """(U, P) NaN where the unit is absent or the carrier."""
-        return _shares(world, static, observers, flat=False)
-
-    def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
-        """(U, P) the body that hides most."""
-        return _blockers(world, static, observers, flat=False)
+    flat: ClassVar[bool] = False
 
 
-class Flat(VisibilityModel):
+class Flat(_BuiltIn):
     """The share of the outline seen from above, with infinitely high bodies."""
 
     kind: Literal["flat"] = "flat"
-
-    def shares(self, world: Tracks, static: Statics, observers: Observers) -> Float:
-        """(U, P) NaN where the unit is absent or the carrier."""
-        return _shares(world, static, observers, flat=True)
-
-    def hidden_by(self, world: Tracks, static: Statics, observers: Observers) -> Int:
-        """(U, P) the body that hides most."""
-        return _blockers(world, static, observers, flat=True)
+    flat: ClassVar[bool] = True
 
 
 BUILT_IN: dict[str, VisibilityModel] = {"surface": Surface(), "flat": Flat()}
@@ -208,22 +214,6 @@ def hidden_by(world: Tracks, static: Statics, observers: Observers, model: Visib
             message = f"hidden_by: expected whole numbers {least} … {expected[1] - 1} of shape {expected}"
             raise wrong(model, "visibility", f"{message}, found {found.dtype.name} of shape {found.shape}", "hidden_by")
     return found
-
-
-def _shares(world: Tracks, static: Statics, observers: Observers, *, flat: bool) -> Float:
-    order, _bounds = world.by_frame
-    seen, _blocker = _views(world, static, observers, flat=flat, blockers=False)
-    shares = np.empty_like(seen)
-    shares[:, order] = seen
-    return shares
-
-
-def _blockers(world: Tracks, static: Statics, observers: Observers, *, flat: bool) -> Int:
-    order, _bounds = world.by_frame
-    _seen, found = _views(world, static, observers, flat=flat, blockers=True)
-    blocker = np.empty_like(found)
-    blocker[:, order] = np.where(found >= 0, order[found], found) if len(order) else found
-    return blocker
 
 
 def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, blockers: bool) -> tuple[Float, Int]:
