@@ -10,10 +10,11 @@ import pytest
 
 from copem_replay.metrics.fixed import fixed_in
 from copem_replay.metrics.summary_text import summary_text
-from copem_replay.report.figures import curves_figure, load_results
+from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.html.page import page
 from copem_replay.report.html.study import load_study
 from copem_replay.results.compare import compare, comparison_text
+from copem_replay.results.read import load_results
 from tests.helpers.report_pages import ONE, Page, changed, replayed
 
 DRAWN_REACTION = ("{kind: constant, delay_s: 0.2}", "{kind: gamma, shape: 4.0, mean_s: 0.2}")

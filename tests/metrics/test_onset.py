@@ -16,7 +16,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import episodes
 from copem_replay.metrics.onset import ONSETS, Onset, OnsetView, Requires
 from copem_replay.perception.visibility import NO_STATICS
-from copem_replay.report.figures import runs_figure
+from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.html.page import page
 from copem_replay.report.html.study import load_study
 from copem_replay.results.read import load_results

@@ -22,21 +22,16 @@ from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import InputError
 from copem_replay.metrics.intervals import every_resample
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence, restricted_mean
-from copem_replay.report.figures import (
-    FIGURES,
-    Results,
-    Selection,
-    answer_figure,
-    curves_figure,
-    differences_figure,
-    load_results,
-    trade_off_figure,
-)
+from copem_replay.report.figures import FIGURES, Selection
+from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.bands import mean_limits
 from copem_replay.report.figures.captions import per_cent, plain
+from copem_replay.report.figures.detection_curves import curves_figure
+from copem_replay.report.figures.differences import differences_figure
 from copem_replay.report.figures.render import lay_out, rendered
 from copem_replay.report.figures.selection import choose, most_telling, that_differ
 from copem_replay.report.figures.style import DARK, WHITE, appearances, contrast, style
+from copem_replay.report.figures.trade_off import trade_off_figure
 from copem_replay.report.html.greys import INK, PAPER, as_variables, dark_greys
 from copem_replay.report.html.headers import (
     difference_header,
@@ -49,6 +44,7 @@ from copem_replay.report.html.headers import (
 from copem_replay.report.html.page import page as report_page
 from copem_replay.report.html.study import load_study
 from copem_replay.results.compare import compare
+from copem_replay.results.read import Results, load_results
 from copem_replay.viewer.selection import telling
 from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed
 

@@ -31,23 +31,19 @@ from copem_replay.experiment.validate import problems, read_logs
 from copem_replay.metrics.intervals import clusters, resamples, share_limits
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT, cumulative_incidence
 from copem_replay.pipeline.run import run
-from copem_replay.report.figures import (
-    Results,
-    curves_figure,
-    distances_figure,
-    latency_breakdown_figure,
-    load_results,
-    runs_figure,
-    sweeps_figure,
-    write_figures,
-)
 from copem_replay.report.figures.bands import band, resampled_incidence
 from copem_replay.report.figures.captions import percent, short_names
-from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, spread
+from copem_replay.report.figures.detection_curves import curves_figure
+from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, distances_figure, spread
 from copem_replay.report.figures.label_layout import last_instant
+from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
 from copem_replay.report.figures.selection import choose
+from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.figures.style import appearances
+from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.timeline import Event
+from copem_replay.report.figures.write import write_figures
+from copem_replay.results.read import Results, load_results
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording

@@ -21,10 +21,10 @@ from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
 from copem_replay.experiment.file import load, parse
 from copem_replay.pipeline import gather
-from copem_replay.report.figures import load_results
 from copem_replay.results import place
 from copem_replay.results import write as results
 from copem_replay.results.compare import compare, comparison_markdown, comparison_text
+from copem_replay.results.read import load_results
 from tests.helpers.experiments import TEXT, changed, drive
 from tests.helpers.recordings import Obj, truth_topic, write_mcap, write_recording
 from tests.helpers.viewer import free_port

@@ -23,7 +23,7 @@ def detection_curves(results: AnyResults, *, configurations: Sequence[str] | Non
     >>> len(cr.plot.detection_curves("out/tc016d").axes) > 0
     True
     """
-    from copem_replay.report.figures import curves_figure
+    from copem_replay.report.figures.detection_curves import curves_figure
 
     return curves_figure(results_of(results), configurations=configurations)
 
@@ -36,7 +36,7 @@ def distances(results: AnyResults, *, configurations: Sequence[str] | None = Non
     >>> len(cr.plot.distances("out/tc016d", configurations=["PEM"]).axes) > 0
     True
     """
-    from copem_replay.report.figures import distances_figure
+    from copem_replay.report.figures.distances import distances_figure
 
     return distances_figure(results_of(results), configurations=configurations)
 
@@ -58,7 +58,7 @@ def single_runs(
     >>> len(cr.plot.single_runs("out/tc016d", run=0).axes) > 0
     True
     """
-    from copem_replay.report.figures import runs_figure
+    from copem_replay.report.figures.single_runs import runs_figure
 
     return runs_figure(results_of(results), configurations=configurations, log=log, object_id=object_id, run=run)
 
@@ -70,7 +70,7 @@ def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) 
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: out/tc016d: expected sweep.csv in it, found none; ...
     """
-    from copem_replay.report.figures import sweeps_figure
+    from copem_replay.report.figures.sweeps import sweeps_figure
 
     return sweeps_figure(results_of(results), configurations=configurations)
 
@@ -94,7 +94,7 @@ def write_figures(
     >>> sorted({file.stem for file in files})
     ['answer', 'curves', 'differences', 'distances', 'latency_breakdown', 'runs']
     """
-    from copem_replay.report.figures import write_figures as write
+    from copem_replay.report.figures.write import write_figures as write
 
     return write(
         results_of(results),

@@ -42,10 +42,6 @@ def _nothing_missing(results: Results, selection: Selection) -> str | None:
     return None
 
 
-def _no_text(results: Results) -> Sequence[str]:
-    return ()
-
-
 @dataclass(frozen=True)
 class FigureKind:
     """A figure. `title`: its heading in the report. `shows`: what it shows, for readers who cannot see it.
@@ -59,7 +55,7 @@ class FigureKind:
     shows: str
     draw: Callable[[Results, Selection], Figure]
     missing: Callable[[Results, Selection], str | None] = _nothing_missing
-    about: Callable[[Results], Sequence[str]] = _no_text
+    about: Callable[[Results], Sequence[str]] = lambda results: ()
     needs_recording: bool = False
 
 
@@ -74,17 +70,6 @@ def _no_differences(results: Results, selection: Selection) -> str | None:
     return None if why is None else ""
 
 
-def _no_trade_off(results: Results, selection: Selection) -> str | None:
-    return no_trade_off(results, results.chosen(selection.configurations))
-
-
-def _trade_off_about(results: Results) -> Sequence[str]:
-    return (
-        "A false positive is an entry of a fused list at no object. A fusion that keeps more entries detects sooner, "
-        "and keeps more false positives.",
-    )
-
-
 def _no_sweep(results: Results, selection: Selection) -> str | None:
     names = results.chosen(selection.configurations)
     if results.sweep is None:
@@ -92,26 +77,6 @@ def _no_sweep(results: Results, selection: Selection) -> str | None:
     if results.sweep["configuration"].isin(names).any():
         return None
     return f"{results.folder}/sweep.csv has no rows of {', '.join(names)}"
-
-
-def _no_stages(results: Results, selection: Selection) -> str | None:
-    return no_stages(results, results.chosen(selection.configurations))
-
-
-def _curves_about(results: Results) -> Sequence[str]:
-    return (
-        "A curve gives the share of all rows (measured objects × runs × logs) that are detected this long after the "
-        "onset: the cumulative incidence of detection (Aalen–Johansen, departure competing). Objects that "
-        "leave the scene undetected count as never detected and keep the curve below 100 %. Where lines coincide, the "
-        "thinner ones are on top.",
-    )
-
-
-def _sweeps_about(results: Results) -> Sequence[str]:
-    return (
-        "The experiment at other values of one quantity, with common random numbers per run. All numbers are in "
-        "sweep.csv.",
-    )
 
 
 FIGURES: dict[str, FigureKind] = {
@@ -130,8 +95,11 @@ FIGURES: dict[str, FigureKind] = {
         "False positives against position error",
         "false positives per minute over the position error, a mark per configuration",
         lambda results, of: trade_off_figure(results, configurations=of.configurations),
-        missing=_no_trade_off,
-        about=_trade_off_about,
+        missing=lambda results, of: no_trade_off(results, results.chosen(of.configurations)),
+        about=lambda results: (
+            "A false positive is an entry of a fused list at no object. A fusion that keeps more entries detects "
+            "sooner, and keeps more false positives.",
+        ),
     ),
     "runs": FigureKind(
         "Single runs",
@@ -143,7 +111,12 @@ FIGURES: dict[str, FigureKind] = {
         "How soon",
         "share detected over the time since the clock started, a line per configuration",
         lambda results, of: curves_figure(results, configurations=of.configurations),
-        about=_curves_about,
+        about=lambda results: (
+            "A curve gives the share of all rows (measured objects × runs × logs) that are detected this long after "
+            "the onset: the cumulative incidence of detection (Aalen–Johansen, departure competing). Objects that "
+            "leave the scene undetected count as never detected and keep the curve below 100 %. Where lines coincide, "
+            "the thinner ones are on top.",
+        ),
     ),
     "distances": FigureKind(
         "How far away",
@@ -155,14 +128,17 @@ FIGURES: dict[str, FigureKind] = {
         "Where the time goes",
         "mean duration of the stages from the start of the clock to detection, a bar per configuration",
         lambda results, of: latency_breakdown_figure(results, configurations=of.configurations),
-        missing=_no_stages,
+        missing=lambda results, of: no_stages(results, results.chosen(of.configurations)),
     ),
     "sweeps": FigureKind(
         "At other values",
         "shares and times over each quantity that is swept",
         lambda results, of: sweeps_figure(results, configurations=of.configurations),
         missing=_no_sweep,
-        about=_sweeps_about,
+        about=lambda results: (
+            "The experiment at other values of one quantity, with common random numbers per run. All numbers are in "
+            "sweep.csv.",
+        ),
     ),
 }
 """By the name of its files, in the order in which they are written."""

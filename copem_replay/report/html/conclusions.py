@@ -57,10 +57,8 @@ def _sentences(study: Study) -> Iterator[str]:
         yield _soonest(study)
         yield from _elsewhere(study)
         yield from _others(study)
-        yield from _against_baseline(study)
         yield from _detected(study, share)
     yield from _passes(study)
-    yield from _accuracy(study)
     yield from _truth(study)
     yield from _how_sure(study)
     yield from _left_out(study)
@@ -187,15 +185,6 @@ def _difference(row: Any, unit: str = " s") -> str:
     return f"{shown} [{plain(row.low)}, {plain(row.high)}]"
 
 
-def _against_baseline(study: Study) -> Iterator[str]:
-    if study.regret is None or study.baseline in study.contenders:  # among whom it is said already
-        return
-    row = _of(study.regret, RANKED_BY).set_index("configuration").loc[study.best]
-    if pd.isna(row["difference"]):
-        return
-    yield f"{study.best} minus {study.baseline}, the baseline: {_difference(row)} in the mean time{_unsure(row)}."
-
-
 def _unsure(row: Any) -> str:
     if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
         return ", without an interval"
@@ -257,22 +246,6 @@ def _share(row: Any) -> str:
     low, high = row["pass_share_low"], row["pass_share_high"]
     shown = f"{per_cent(float(row['pass_share']))} %"
     return shown if pd.isna(low) else f"{shown} [{per_cent(float(low))}, {per_cent(float(high))}]"
-
-
-def _accuracy(study: Study) -> Iterator[str]:
-    rows = study.results.summary.set_index("configuration")
-    if "gospa_m" not in rows:
-        return
-    known = rows.loc[list(study.contenders), "gospa_m"].dropna().astype(float)
-    own = rows.loc[known.index, "list_rate_hz"].round(2).nunique() > 1
-    more = "; each over its own lists, of which some have more than others" if own else ""
-    if len(known) > 1 and known.min() < known.max():
-        best, worst = (list(known.index[(known - one).abs() <= NOTHING]) for one in (known.min(), known.max()))
-        yield (
-            f"The best lists are those of {together(best)}, by means without an interval: GOSPA (positions, misses and "
-            f"false positives in one number) of {plain(known.min())} m, against {plain(known.max())} m with "
-            f"{together(worst)}{more}."
-        )
 
 
 def _truth(study: Study) -> Iterator[str]:
