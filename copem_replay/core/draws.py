@@ -92,7 +92,10 @@ class Draws:
         lists = None if part.of in ("object", "all") else self.lists
         if part.of == "unit":  # of a list, not of each row in it
             of_list = RandomKey(
-                random_key.units, self.lists.unit_ix, _everyone(random_key, self.lists), self.lists.stamp_ns
+                random_key.units,
+                self.lists.unit_ix,
+                np.repeat(random_key.object_word[:1], len(self.lists.stamp_ns)),
+                self.lists.stamp_ns,
             )
             there = np.unique(self.lists.frame_ix)
             some = ListTimes(self.lists.stamp_ns, self.lists.unit_ix, there)
@@ -114,8 +117,3 @@ class Draws:
         draw: Callable[[str, RandomKey, Int], Float] = self.rng.normal if normal else self.rng.uniform
         found = draw(purpose, random_key.take(np.flatnonzero(new)), self.runs)
         return np.repeat(found, np.diff(np.append(np.flatnonzero(new), len(new))), axis=1)
-
-
-def _everyone(random_key: RandomKey, lists: ListTimes) -> np.ndarray:
-    """(F,) the word that all rows of a common address have."""
-    return np.repeat(random_key.object_word[:1], len(lists.stamp_ns))

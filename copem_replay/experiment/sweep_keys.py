@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
@@ -35,6 +35,7 @@ def _none_or_lasting(value: float) -> float:
 
 Lasting = Annotated[float, Field(strict=True, ge=0, le=86_400), AfterValidator(_none_or_lasting)]
 """A correlation time in seconds; 0: nothing lasts."""
+_UNSAID: Any = Field(default=None, exclude_if=lambda value: value is None)
 SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
 
 
@@ -45,10 +46,10 @@ class SweptBy(Frozen):
     rate_hz: SweptNames | None = None
     units: SweptNames | None = None
     penetration_rate: SweptNames | None = None
-    correlation_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
-    ghosts_in_list: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
-    loss: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
-    burst_s: SweptNames | None = Field(default=None, exclude_if=lambda names: names is None)
+    correlation_s: SweptNames | None = _UNSAID
+    ghosts_in_list: SweptNames | None = _UNSAID
+    loss: SweptNames | None = _UNSAID
+    burst_s: SweptNames | None = _UNSAID
 
 
 def _swept_by(value: object) -> str:
@@ -75,18 +76,10 @@ class Sweep(Frozen):
     rate_hz: Annotated[tuple[Rate, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     units: Annotated[tuple[Units, ...], Field(min_length=1), AfterValidator(_once)] | None = None
     penetration_rate: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = None
-    correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
-        default=None, exclude_if=lambda values: values is None
-    )
-    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
-        default=None, exclude_if=lambda values: values is None
-    )
-    loss: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
-        default=None, exclude_if=lambda values: values is None
-    )
-    burst_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = Field(
-        default=None, exclude_if=lambda values: values is None
-    )
+    correlation_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = _UNSAID
+    ghosts_in_list: Annotated[tuple[MeanNumber, ...], Field(min_length=1), AfterValidator(_once)] | None = _UNSAID
+    loss: Annotated[tuple[Share, ...], Field(min_length=1), AfterValidator(_once)] | None = _UNSAID
+    burst_s: Annotated[tuple[Lasting, ...], Field(min_length=1), AfterValidator(_once)] | None = _UNSAID
 
     @model_validator(mode="after")
     def _some(self) -> Self:

@@ -10,7 +10,7 @@ import numpy as np
 
 from copem_replay.core.errors import EgoError
 from copem_replay.core.rotation import turned, yaw_of
-from copem_replay.core.tracks import CLASSES, VALUES, Float
+from copem_replay.core.tracks import CLASSES, VALUES
 from copem_replay.io.channel import Channel, schema_name
 from copem_replay.io.log import Log
 from copem_replay.io.schemas.decoded import VX, VY, YAW, DecodedObjects, Z
@@ -105,10 +105,6 @@ def with_ego(columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic 
         moving=np.append(columns.moving, True),
         object_ix=np.append(columns.object_ix, np.full(len(mine), number))[order],
         class_ix=np.append(columns.class_ix, np.full(len(mine), CLASSES.index("car"), dtype=np.int8))[order],
-        values=_stacked(columns.values, rows[mine])[order],
+        values=np.concatenate([columns.values, rows[mine]])[order],
         hosts=(name,),
     )
-
-
-def _stacked(first: Float, second: Float) -> Float:
-    return np.concatenate([first, second])

@@ -49,14 +49,11 @@ class LogContext:
         """The frames of lists as they are known here."""
         return [self.own.get((found.part, name.lstrip("/")), name.lstrip("/")) for name in found.frames]
 
-    def world_for(self, frame: str) -> str:
-        """The frame that all is brought into, where lists are in `frame`."""
-        return self.ego.parent if self.ego is not None else self.frames.world_of(frame)
-
     def world_of(self, found: DecodedLists) -> str:
         """The frame that lists are brought into, "" where no list names one."""
         said = found.frame_code[found.frame_code >= 0]
-        return self.world_for(self.named(found)[said[0]] if len(said) else "")
+        frame = self.named(found)[said[0]] if len(said) else ""
+        return self.ego.parent if self.ego is not None else self.frames.world_of(frame)
 
 
 def log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool) -> LogContext:

@@ -175,13 +175,10 @@ def _masts(truth: Tracks, rows: Int, objects: Int) -> list[Mast]:
     step = max(1, len(truth.x_m[0]) // _ROWS)
     everyone = np.stack([truth.x_m[0, ::step], truth.y_m[0, ::step]], axis=1)
     turns = np.deg2rad(np.arange(0, 360, 45))
-    free = [_free_m(everyone, centre + MAST_M * np.array([np.cos(t), np.sin(t)])) for t in turns]
+    around = [centre + MAST_M * np.array([np.cos(t), np.sin(t)]) for t in turns]
+    free = [float(np.hypot(*(everyone - place).T).min()) for place in around]
     best = int(np.argmax(np.round(free, 3)))
     return [_mast(centre, float(turns[(best + more) % 8])) for more in (0, 4)]
-
-
-def _free_m(everyone: Float, place: Float) -> float:
-    return float(np.hypot(*(everyone - place).T).min())
 
 
 def _mast(centre: Float, turn: float) -> Mast:

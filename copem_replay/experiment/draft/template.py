@@ -17,14 +17,9 @@ _FUSED = {"fusion", "fused", "stack"}
 _OTHERS = 6  # topics named in a comment (chosen)
 
 
-def main_truth(survey: Survey) -> TruthFound:
-    """Of the lists of true objects that were read, the one with the most object states."""
-    return max(survey.truth, key=lambda truth: truth.states)
-
-
 def commented(survey: Survey) -> str:
     """The experiment with a word on each key; it runs as it is."""
-    truth = main_truth(survey)
+    truth = max(survey.truth, key=lambda truth: truth.states)
     guess = truth.suggested
     recorded, outputs = _recorded(truth)
     ego = guess.ego != "none"
@@ -192,18 +187,13 @@ def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool)
     ]  # fmt: skip
     for name in recorded:
         rows.append((name, f"{{units: [{name}], fusion: {{kind: gnn}}}}", "as it was recorded"))
-        if not (ego and _of_ego(name)):  # else the ego twice, as recorded and as modelled
+        if not (ego and name.startswith("ego")):  # else the ego twice, as recorded and as modelled
             rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], fusion: {{kind: gnn}}}}", "and together"))
     if len(recorded) > 1:
         rows.append(("recorded", f"{{units: [{', '.join(recorded)}], fusion: {{kind: gnn}}}}", "all of them"))
     width = max(len(name) for name, _, _ in rows) + 1
     for name, value, what in rows:
         yield f"  {name + ':':<{width}} {value}   # {what}"
-
-
-def _of_ego(name: str) -> bool:
-    """Whether lists are the ego's own, by their name."""
-    return name.startswith("ego")
 
 
 def _outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[str]) -> Iterator[str]:

@@ -39,7 +39,7 @@ class _Dtype:
 
     __slots__ = ("dtype",)
 
-    def __init__(self, name: str, align: object = False, copy: object = False) -> None:
+    def __init__(self, name: str) -> None:
         dtype = np.dtype(str(name))
         if dtype.kind not in "biufcSUO" or dtype.names is not None or dtype.subdtype is not None:
             raise pickle.UnpicklingError(f"an array of {name}")
@@ -84,16 +84,20 @@ class _Restricted(pickle.Unpickler):
         super().__init__(io.BytesIO(data))
         self._left = _TIMES * len(data)
         self._safe: dict[tuple[str, str], Any] = {
-            ("collections", "OrderedDict"): self._ordered,
-            ("collections", "defaultdict"): self._default,
+            ("collections", "OrderedDict"): lambda items=(): collections.OrderedDict(self._counted(items)),
+            ("collections", "defaultdict"): lambda factory=None: {},  # what it would make of a key is not called
             ("_codecs", "encode"): self._encode,
             ("numpy", "ndarray"): _NDARRAY,
-            ("numpy", "dtype"): self._dtype,
+            ("numpy", "dtype"): lambda name, align=False, copy=False: _Dtype(name),
         }
         for module in ("builtins", "__builtin__"):
             self._safe |= {(module, kind): _KIND for kind in _KINDS}
-            self._safe |= {(module, "complex"): self._complex, (module, "bytes"): self._no_bytes}
-            self._safe |= {(module, "set"): self._set, (module, "frozenset"): self._frozenset}
+            self._safe |= {
+                (module, "complex"): lambda real, imag: complex(real, imag),
+                (module, "bytes"): lambda: b"",  # how old pickles spell none
+                (module, "set"): lambda items=(): set(self._counted(items)),
+                (module, "frozenset"): lambda items=(): frozenset(self._counted(items)),
+            }
         for core in ("numpy.core", "numpy._core"):
             self._safe[f"{core}.multiarray", "_reconstruct"] = self._reconstruct
             self._safe[f"{core}.multiarray", "scalar"] = self._scalar
@@ -114,35 +118,12 @@ class _Restricted(pickle.Unpickler):
         self._take(len(items))
         return items
 
-    def _set(self, items: Any = ()) -> set[Any]:
-        return set(self._counted(items))
-
-    def _frozenset(self, items: Any = ()) -> frozenset[Any]:
-        return frozenset(self._counted(items))
-
-    def _ordered(self, items: Any = ()) -> dict[Any, Any]:
-        return collections.OrderedDict(self._counted(items))
-
-    def _default(self, factory: object = None) -> dict[Any, Any]:
-        """A plain dict: what it would make of a key that it has not is of no use here, and is not called."""
-        return {}
-
-    def _complex(self, real: float, imag: float) -> complex:
-        return complex(real, imag)
-
-    def _no_bytes(self) -> bytes:
-        """How old pickles spell none."""
-        return b""
-
     def _encode(self, text: str, encoding: str = "latin1") -> bytes:
         """How old pickles spell bytes; no other codec, some of them unpack."""
         if encoding != "latin1":
             raise pickle.UnpicklingError(f"bytes as {encoding}")
         encoded: bytes = self._counted(text).encode("latin1")
         return encoded
-
-    def _dtype(self, name: str, align: object = False, copy: object = False) -> _Dtype:
-        return _Dtype(name, align, copy)
 
     def _reconstruct(self, kind: object, shape: tuple[int, ...], dtype: object) -> _Array:
         """Return an empty array, which its state fills: no pickle asks for a larger one."""

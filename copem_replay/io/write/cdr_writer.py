@@ -31,11 +31,6 @@ def filled(data: bytes, size: int = 4) -> bytes:
     return data + bytes(-len(data) % size)
 
 
-def string_message(value: str) -> bytes:
-    """std_msgs/String."""
-    return HEAD + text(value)
-
-
 class Cdr:
     """A message that grows field by field, each aligned to its own size."""
 

@@ -271,7 +271,7 @@ class _AsString:
         self._writer = writer
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        return (cdr_write.string_message(data.decode()) for data in self._writer.messages(available_ns))
+        return (cdr_write.HEAD + cdr_write.text(data.decode()) for data in self._writer.messages(available_ns))
 
 
 class _ListByList:
