@@ -80,26 +80,32 @@ def take_apart(
 ) -> Shredded:
     """Take messages apart; a path may name one item of a list, `position[0]`, counted from 0.
 
-    Such a column is of the level that is left when the item is chosen: `objects[].position[0]` of `objects[]`. Raises
-    KeyError for a path that is not offered, or chooses an item of a list and then all of one in it.
+    Such a column is of the level that is left when the item is chosen: `objects[].position[0]` of `objects[]`,
+    `sensors[0].objects[].x` of `sensors[0].objects[]`. Raises KeyError for a path that is not offered.
     """
     numbers, texts = tuple(numbers), tuple(texts)
     picked = [p for p in dict.fromkeys((*numbers, *texts)) if _ITEM.search(p) and not definition.picks(p)]
     whole = [[any_item(p) if p in picked else p for p in paths] for paths in (numbers, texts)]
     found = definition.shred(payloads, *whole)
     levels = dict(found.levels)
+    chosen: dict[str, Int] = {}
     for path in picked:
         level = level_of(path)
-        if level != any_item(level):
-            raise KeyError(path)
+        _choose_level(levels, chosen, level)
         source = level_of(any_item(path))
         rows = np.arange(len(levels[source].parent))
         at, inner = rows, source
-        for step in reversed(_ITEM.findall(path[len(level) :])):
-            good = _place_in_parent(levels[inner].parent)[at] == int(step)
+        for step in reversed(_items_chosen(path)):
+            good = _place_in_parent(levels[inner].parent)[at] == step
             rows, at = rows[good], levels[inner].parent[at[good]]
             inner = above(inner)
-        levels[level] = _with_items(levels[level], levels[source], path, at, rows)
+        to = at
+        if level in chosen:  # its rows are some of those of the whole level
+            number = np.full(len(levels[inner].parent), -1)
+            number[chosen[level]] = np.arange(len(chosen[level]))
+            to = number[at]
+            rows, to = rows[to >= 0], to[to >= 0]
+        levels[level] = _with_items(levels[level], levels[source], path, to, rows)
     return Shredded(levels, found.decoded)
 
 
@@ -126,6 +132,32 @@ _ITEM = re.compile(r"\[(\d{1,9})\]")
 def any_item(path: str) -> str:
     """The path with every item of its lists: `position[]` of `position[0]`."""
     return _ITEM.sub("[]", path)
+
+
+def _items_chosen(path: str) -> list[int]:
+    """The items chosen after the last `[]`: 1 and 0 of `objects[].b[1].c[0]`."""
+    return [int(k) for k in _ITEM.findall(path[len(level_of(path)) :])]
+
+
+def _choose_level(levels: dict[str, Level], chosen: dict[str, Int], name: str) -> None:
+    """Make the level `name`, and those above it, of the rows that lie in the items it names; note which those are."""
+    if name in levels:
+        return
+    outer = above(name)
+    _choose_level(levels, chosen, outer)
+    whole = any_item(name)
+    rows = np.arange(len(levels[whole].parent))
+    at, inner = levels[whole].parent, above(whole)
+    for step in reversed(_items_chosen(name.removesuffix("[]"))):
+        good = _place_in_parent(levels[inner].parent)[at] == step
+        rows, at = rows[good], levels[inner].parent[at[good]]
+        inner = above(inner)
+    if outer in chosen:
+        number = np.full(len(levels[inner].parent), -1)
+        number[chosen[outer]] = np.arange(len(chosen[outer]))
+        good = number[at] >= 0
+        rows, at = rows[good], number[at[good]]
+    levels[name], chosen[name] = Level(at, {}, {}), rows
 
 
 def _place_in_parent(parent: Int) -> Int:

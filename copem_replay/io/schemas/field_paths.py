@@ -22,8 +22,9 @@ class Wanted:
 
     def __init__(self, description: Description, offers: Collection[str]) -> None:
         self._fields, self._described, self._offers = description.fields, description, offers
+        objects = any_item(self._fields.objects)
         lists = {level for path in offers for level in levels_to([path]) if level}
-        if self._fields.objects not in lists:
+        if objects not in lists or not self._fields.objects.endswith("[]"):
             raise self._lacks("objects", self._fields.objects, "list", sorted(lists))
         said = self._fields.class_
         self.class_ = Class(path=said) if isinstance(said, str) else said
@@ -48,7 +49,7 @@ class Wanted:
 
     def _need(self, key: str, path: str, within: str | None = None) -> str:
         """The path. Raises FieldsError where messages do not have it, or several of it `within` one of a list."""
-        if any_item(path) not in self._offers or any_item(level_of(path)) != level_of(path):
+        if any_item(path) not in self._offers:
             raise self._lacks(key, path)
         if within is not None and level_of(path) not in levels_to([within]):
             level = level_of(path)
