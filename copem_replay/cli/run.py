@@ -36,7 +36,8 @@ def run(
         bool, typer.Option("--skip-unreadable", help="Leave out recordings that cannot be replayed.")
     ] = False,
     pieces: Annotated[
-        str | None, typer.Option(metavar="FOLDER", help="Where finished pieces are kept, and found again.")
+        str | None,
+        typer.Option(metavar="FOLDER", help="Where finished pieces are kept, and found again: a folder or a URL."),
     ] = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
@@ -65,7 +66,7 @@ def run(
         notes = fill(place, result, skipped=study.skipped, viewer=url)
         if kept is not None:
             note(kept.damaged)
-            complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.root}"])
+            complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.store.where}"])
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
         note([*place.notes, *skipped, *notes, *result.replayed.costs])
         print(summary_text(result.summary, width_of(sys.stdout)))

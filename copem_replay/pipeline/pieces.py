@@ -1,4 +1,4 @@
-"""Pieces that are kept: a folder in which what was computed once is found again, by the key of its recipe.
+"""Pieces that are kept: in a folder or under a URL, what was computed once is found again by the key of its recipe.
 
     pieces/ab/<key>.parquet        rows of `detections.parquet`, and what stands beside them; the recipe in the metadata
     pieces/ab/<key>.sums.parquet   a row per run, sums of accuracy in the metadata; written first
@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -23,10 +21,10 @@ import pandas as pd
 import pyarrow as pa
 from pyarrow import parquet
 
-from copem_replay.core.errors import OutputError
 from copem_replay.metrics.accuracy.statistics import BAND, EXISTENCE, OBJECT, RUN, Settings, Total
 from copem_replay.pipeline.log_tables import BESIDE, RUNS, LogTables
 from copem_replay.pipeline.recipe import canonical, key_of
+from copem_replay.pipeline.store import Store, store_at
 
 ROWS_A_PIECE = 250_000
 """Rows of a range of runs at most (chosen: some MB)."""
@@ -55,52 +53,49 @@ def ranges(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
 
 
 class Pieces:
-    """A folder of pieces. `found`, `computed`: how many so far; `damaged`: those that had to be computed again."""
+    """What is kept at an address: a folder or a URL. `found`, `computed`: how many so far; `damaged`: those that had to
+    be computed again. Raises InputError, OutputError where nothing can be kept.
+    """
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    def __init__(self, address: str | Path) -> None:
+        self.store: Store = store_at(address)
         self.found = self.computed = 0
         self.damaged: list[str] = []
-        try:
-            for name in ("pieces", "logs"):
-                (root / name).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"--pieces: {root}: cannot be written: {error.strerror or error}") from error
 
     def read(self, recipe: str, log: str, configuration: str) -> LogTables | None:
-        """A piece of a log and configuration; None: it is not there, or damaged."""
-        place = self._place(recipe)
-        if not place.is_file():
-            return None
+        """A piece of a log and configuration; None: it is not there, or damaged. Raises InputError."""
+        name = name_of(recipe)
         try:
-            piece = _read(place, recipe, log, configuration)
+            content = self.store.read(name)
+            piece = None if content is None else _read(content, self.store, recipe, log, configuration)
         except (OSError, ValueError, KeyError, TypeError) as error:  # what Arrow raises derives from these
-            self.damaged.append(f"{place}: damaged, computed again ({' '.join(str(error).split())[:120]})")
+            said = " ".join(str(error).split())[:120]
+            self.damaged.append(f"{self.store.where}/{name}: damaged, computed again ({said})")
             return None
-        self.found += 1
+        self.found += piece is not None
         return piece
 
     def write(self, recipe: str, piece: LogTables) -> LogTables:
         """Keep a piece. Returns it as it will be read. Raises OutputError."""
         assert isinstance(piece.rows, pd.DataFrame)
-        place, rows = self._place(recipe), pa.Table.from_pandas(piece.rows, preserve_index=False)
+        name, rows = name_of(recipe), pa.Table.from_pandas(piece.rows, preserve_index=False)
         said = {b"recipe": recipe.encode()}
         table = rows.drop_columns(list(_WHOSE))
         if piece.beside is not None and piece.runs is not None:
             totals = canonical([[count, _as_json(of)] for nodes in piece.totals.values() for count, of in nodes])
             sums = _sealed(piece.runs.drop_columns(list(_WHOSE)), {b"sums": totals.encode()})
-            self._put(place.with_suffix(".sums.parquet"), sums)
+            self.store.write(_sums_of(name), sums)
             said[b"sums"] = _digest(sums)
-            for name in piece.beside.column_names:
-                table = table.append_column(_BESIDE + name, piece.beside[name])
-        self._put(place, _sealed(table, said))
+            for column in piece.beside.column_names:
+                table = table.append_column(_BESIDE + column, piece.beside[column])
+        self.store.write(name, _sealed(table, said))
         self.computed += 1
         return LogTables(piece.log, rows, piece.beside, piece.runs, piece.totals)
 
     def known(self, about: str) -> dict[str, Any] | None:
         """What is known of a log, by all that it was made of; None: nothing."""
         try:
-            said: Any = json.loads((self.root / "logs" / f"{key_of(about)}.json").read_bytes())
+            said: Any = json.loads(self.store.read(f"logs/{key_of(about)}.json") or b"")
             digest = said.pop("digest")
         except (OSError, ValueError, KeyError, AttributeError):
             return None
@@ -109,27 +104,17 @@ class Pieces:
     def keep(self, about: str, said: Mapping[str, Any]) -> None:
         """And for the next time. Raises OutputError."""
         text = canonical(dict(said) | {"digest": key_of(canonical(said))})
-        self._put(self.root / "logs" / f"{key_of(about)}.json", text.encode())
+        self.store.write(f"logs/{key_of(about)}.json", text.encode())
 
-    def _place(self, recipe: str) -> Path:
-        key = key_of(recipe)
-        return self.root / "pieces" / key[:2] / f"{key}.parquet"
 
-    def _put(self, place: Path, content: bytes) -> None:
-        """Complete under its name, or not there."""
-        try:
-            place.parent.mkdir(exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=place.parent, prefix=f".{place.name}.", delete=False) as file:
-                try:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
-                    os.replace(file.name, place)
-                except BaseException:
-                    Path(file.name).unlink(missing_ok=True)
-                    raise
-        except OSError as error:
-            raise OutputError(f"{place}: cannot be written: {error.strerror or error}") from error
+def name_of(recipe: str) -> str:
+    """What the piece that is made by a recipe is called in a store."""
+    key = key_of(recipe)
+    return f"pieces/{key[:2]}/{key}.parquet"
+
+
+def _sums_of(name: str) -> str:
+    return name.removesuffix(".parquet") + ".sums.parquet"
 
 
 def _digest(content: bytes) -> bytes:
@@ -153,9 +138,9 @@ def _opened(content: bytes) -> pa.Table:
     return parquet.ParquetFile(pa.BufferReader(content)).read(use_threads=False)  # for so little they only cost time
 
 
-def _read(place: Path, recipe: str, log: str, configuration: str) -> LogTables:
+def _read(content: bytes, store: Store, recipe: str, log: str, configuration: str) -> LogTables:
     """Raises ValueError, KeyError, TypeError or OSError where anything is not as it was written."""
-    table = _opened(place.read_bytes())
+    table = _opened(content)
     said = table.schema.metadata
     if said[b"recipe"] != recipe.encode():
         raise ValueError("another recipe")
@@ -163,10 +148,10 @@ def _read(place: Path, recipe: str, log: str, configuration: str) -> LogTables:
     rows = _whose(table.select(names), log, configuration)
     if b"sums" not in said:
         return LogTables(log, rows)
-    content = place.with_suffix(".sums.parquet").read_bytes()
-    if _digest(content) != said[b"sums"]:
+    beside_it = store.read(_sums_of(name_of(recipe)))
+    if beside_it is None or _digest(beside_it) != said[b"sums"]:
         raise ValueError("other sums")
-    sums = _opened(content)
+    sums = _opened(beside_it)
     nodes = [(count, _total(of)) for count, of in json.loads(sums.schema.metadata[b"sums"])]
     beside = table.select([name for name in table.column_names if name.startswith(_BESIDE)])
     beside = beside.rename_columns([name.removeprefix(_BESIDE) for name in beside.column_names])

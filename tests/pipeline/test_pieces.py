@@ -168,8 +168,8 @@ def test_more_runs_have_the_same_ranges_but_the_last(episodes: int) -> None:
 
 def test_where_nothing_can_be_kept(here: Path) -> None:
     Path("e.yaml").write_text(study())
-    with pytest.raises(InputError, match=r"^--pieces: expected a folder, found s3://here$"):
-        cr.run("e.yaml", pieces="s3://here")
+    with pytest.raises(InputError, match=r"^--pieces: drives://here: expected a protocol that fsspec knows"):
+        cr.run("e.yaml", pieces="drives://here")
     with pytest.raises(OutputError, match=r"^--pieces: a.mcap: cannot be written: Not a directory$"):
         cr.run("e.yaml", pieces="a.mcap")
 

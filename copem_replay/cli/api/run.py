@@ -139,8 +139,8 @@ def run(
 
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
     paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
-    depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder in which what was
-    computed is kept, and found by the next run (docs/guide/scale.md).
+    depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder or a URL where what
+    was computed is kept, and found by the next run (docs/guide/scale.md).
 
     Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
     both together, times without a closed form, runs that no memory holds.
@@ -154,13 +154,11 @@ def run(
     return replayed(study, prepared(study)[0], jobs, progress, kept)
 
 
-def pieces_in(url: str) -> Pieces:
-    """A folder of pieces. Raises InputError, OutputError."""
+def pieces_in(address: str) -> Pieces:
+    """The pieces in a folder, or under a URL. Raises InputError, OutputError."""
     from copem_replay.pipeline.pieces import Pieces
 
-    if "://" in url:
-        raise InputError(f"--pieces: expected a folder, found {url}")
-    return Pieces(Path(url))
+    return Pieces(address)
 
 
 def replayed(
