@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,7 @@ class Pieces:
     """
 
     def __init__(self, address: str | Path) -> None:
+        self.address = str(address)
         self.store: Store = store_at(address)
         self.found = self.computed = 0
         self.damaged: list[str] = []
@@ -92,6 +93,11 @@ class Pieces:
         self.computed += 1
         return LogTables(piece.log, rows, piece.beside, piece.runs, piece.totals)
 
+    def keys(self) -> Callable[[str], bool]:
+        """Whether there is a piece, by its key. Under a URL all is listed anew, what other processes wrote, too."""
+        self.store.refresh()
+        return lambda key: self.store.exists(_name(key))
+
     def known(self, about: str) -> dict[str, Any] | None:
         """What is known of a log, by all that it was made of; None: nothing."""
         try:
@@ -109,7 +115,10 @@ class Pieces:
 
 def name_of(recipe: str) -> str:
     """What the piece that is made by a recipe is called in a store."""
-    key = key_of(recipe)
+    return _name(key_of(recipe))
+
+
+def _name(key: str) -> str:
     return f"pieces/{key[:2]}/{key}.parquet"
 
 

@@ -37,6 +37,9 @@ class Store(Protocol):
     def names(self) -> set[str]:
         """All names, listed anew: what other processes have written is among them."""
 
+    def refresh(self) -> None:
+        """Find what other processes have written since."""
+
 
 def store_at(address: str | Path) -> Store:
     """The store in a folder, or under a URL. Raises InputError, OutputError."""
@@ -74,9 +77,8 @@ class Folder:
             place.parent.mkdir(exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=place.parent, prefix=f".{place.name}.", delete=False) as file:
                 try:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
+                    file.write(content)  # not waited for until it is on the disk: what a crash damages has no seal
+                    file.close()
                     os.replace(file.name, place)
                 except BaseException:
                     Path(file.name).unlink(missing_ok=True)
@@ -88,6 +90,9 @@ class Folder:
         """All files but those that are being written."""
         files = (path for path in self.root.rglob("[!.]*") if path.is_file())
         return {path.relative_to(self.root).as_posix() for path in files}
+
+    def refresh(self) -> None:
+        """Nothing to do: each file is looked for when it is asked for."""
 
 
 class Bucket:
@@ -145,3 +150,7 @@ class Bucket:
             found = fs.find(path)
         self._listed = {name.partition(f"{path}/")[2] for name in found}
         return self._listed
+
+    def refresh(self) -> None:
+        """List anew."""
+        self.names()
