@@ -46,6 +46,7 @@ def run(
     """Replay an experiment, write its results, print the summary."""
     from copem_replay.cli.api.run import pieces_in
     from copem_replay.cli.api.study import prepared, read_study
+    from copem_replay.pipeline.log_survey import LogSurvey
     from copem_replay.results.place import check_inputs, taken
 
     source = source_with(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
@@ -53,7 +54,7 @@ def run(
         note(place.notes)
         place.notes.clear()
         kept = None if pieces is None else pieces_in(pieces)
-        study = read_study(source, skip_unreadable=skip_unreadable, pieces=kept)
+        study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(kept))
         check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
         url = _viewer(study.experiment, viewer) if live or viewer is not None else None
         from copem_replay.cli.api.run import fill, replayed

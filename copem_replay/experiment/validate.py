@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 from copem_replay.core.errors import EgoError, InputError, RecordingError, printable
 from copem_replay.core.text import unknown
@@ -102,16 +103,21 @@ def log_names(paths: Sequence[Path]) -> list[str]:
         depth = [d + twice for d, twice in zip(depth, again, strict=True)]
 
 
-Known = Callable[[Place, Experiment, Callable[[], Recording]], Recording | None]
-"""What is known from before of the recording at a place, in an experiment resolved for it, and how it is read; None:
-it has to be read."""
+class Survey(Protocol):
+    """What becomes of logs as they are read, each in the experiment resolved for it; `read`: it, once more."""
+
+    def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
+        """The recording as it is known from before; None: it has to be read."""
+
+    def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
+        """What stays in memory of a recording."""
 
 
 def read_logs(
     experiment: Experiment,
     paths: Mapping[Place, Key | None] | Iterable[Place],
     source: Source | None,
-    known: Known | None = None,
+    survey: Survey | None = None,
 ) -> tuple[list[Recording], list[Refused]]:
     """The recordings that can be replayed, and what is wrong with those that cannot.
 
@@ -129,14 +135,16 @@ def read_logs(
         elif (place := identity(path)) not in recordings:
             entry, settings = mine.get(place, (None, None))
             alone = experiment if settings is None else with_settings(experiment, settings)
-            recording = None if known is None else known(path, alone, partial(_again, alone, path))
-            wrong: list[Refused] = []
+            again, wrong = partial(_again, alone, path), list[Refused]()
+            recording = None if survey is None else survey.known(path, alone, again)
             if recording is None:
                 recording, wrong = _read(alone, path)
+                if recording is not None and not wrong and survey is not None:
+                    recording = survey.kept(recording, alone, again)
             refused += [log.within(entry, settings) for log in wrong]
             if recording is not None and not wrong:
-                again = names_of.get(place, [])
-                said = [f"named more than once ({', '.join(again)}): replayed once"] if len(again) > 1 else []
+                named = names_of.get(place, [])
+                said = [f"named more than once ({', '.join(named)}): replayed once"] if len(named) > 1 else []
                 recordings[place] = replace(recording, notes=tuple(dict.fromkeys((*said, *recording.notes))))
     # Named when it is known which there are: the experiment that is written with the results names only these.
     given = {place: settings.name for place, (_, settings) in mine.items() if settings.name is not None}

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 
 import pandas as pd
 import pyarrow as pa
 
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.blocks import blocks, outcomes
+from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
 from copem_replay.pipeline.closed_form import exact_table
 from copem_replay.pipeline.cost import Cost
 from copem_replay.pipeline.log_tables import LogTables, joined, log_tables
@@ -32,6 +33,7 @@ class _Range:
     experiment: Experiment  # of the log, with these configurations
     runs: tuple[int, int]
     recipes: dict[str, str] = field(default_factory=dict)  # by configuration; none: nothing is kept
+    last: bool = False  # of its log
 
 
 class Gatherer:
@@ -39,12 +41,13 @@ class Gatherer:
 
     def __init__(self, jobs: int, progress: Progress | None, tables: int, cost: Cost, pieces: Pieces | None) -> None:
         self._jobs, self._progress, self._tables, self._cost, self._pieces = jobs, progress, tables, cost, pieces
-        self._done = 0
+        self._done = self._runs = 0  # of the runs of all logs, in all tables
 
     def of(self, logs: Sequence[StudyLog], experiment: Experiment) -> list[LogTables]:
-        """The tables of each log: of all its configurations and runs."""
+        """The tables of each log: of all its configurations and runs. A log is in memory while it is its turn."""
         found: dict[tuple[str, str, tuple[int, int]], LogTables] = {}
-        plan = [of_range for log in logs for of_range in self._missing(log, experiment, found)]
+        self._runs = self._tables * len(logs) * experiment.runs
+        plan = (of_range for log in logs for of_range in self._missing(log, experiment, found))
         whole: dict[str, LogTables] = {}
         for of_range, tables in self._computed(plan):
             name = of_range.log.name
@@ -60,7 +63,9 @@ class Gatherer:
         """The rows of `exact.parquet` of a log."""
         alone = of_log(experiment, log.name)
         if self._pieces is None:
-            return exact_table(log.replay(), alone)
+            table = exact_table(log.replay(), alone)
+            log.drop()
+            return table
         parts = []
         for name, configuration in alone.configurations.items():
             made_by = recipe(alone, name, log.identity, None)
@@ -69,17 +74,18 @@ class Gatherer:
                 mine = alone.model_copy(update={"configurations": {name: configuration}})
                 piece = self._pieces.write(made_by, LogTables(log.name, exact_table(log.replay(), mine)))
             parts.append(piece.rows)
+        log.drop()
         return frame_of(parts)
 
     def _missing(
         self, log: StudyLog, experiment: Experiment, found: dict[tuple[str, str, tuple[int, int]], LogTables]
-    ) -> Iterator[_Range]:
+    ) -> list[_Range]:
         """What has to be computed of a log; what is there already is put among what is `found`."""
-        alone = of_log(experiment, log.name)
+        alone, facts = of_log(experiment, log.name), log.facts(experiment)
         if self._pieces is None:
-            yield _Range(log, alone, (0, alone.runs))
-            return
-        for runs in ranges(alone.runs, log.facts(experiment).episodes):
+            return [_Range(log, alone, (0, alone.runs), last=True)]
+        plan: list[_Range] = []
+        for runs in ranges(alone.runs, facts.episodes):
             missing = {}
             for name in alone.configurations:
                 made_by = recipe(alone, name, log.identity, runs)
@@ -90,34 +96,46 @@ class Gatherer:
                     found[log.name, name, runs] = piece
             if missing:
                 mine = {name: alone.configurations[name] for name in missing}
-                yield _Range(log, alone.model_copy(update={"configurations": mine}), runs, missing)
+                plan.append(_Range(log, alone.model_copy(update={"configurations": mine}), runs, missing))
+            else:
+                self._went(runs[1] - runs[0])
+        if not plan:
+            log.drop()
+        return [replace(one, last=one is plan[-1]) for one in plan]
 
-    def _computed(self, plan: Sequence[_Range]) -> Iterator[tuple[_Range, LogTables]]:
-        """The tables of ranges, one after the other as they are done."""
-        work, last = [], []
-        for of_range in plan:
-            replay = of_range.log.replay()
-            cut = blocks(replay, of_range.experiment, self._jobs, of_range.runs)
-            work += [(replay, of_range.experiment, block) for block in cut]
-            last.append(len(work))
+    def _computed(self, plan: Iterable[_Range]) -> Iterator[tuple[_Range, LogTables]]:
+        """The tables of ranges, one after the other. No log is read before the workers have nearly nothing to do."""
         pool, began_s = ThreadPoolExecutor(self._jobs), time.perf_counter()
+        waiting: deque[tuple[_Range, list[tuple[int, Future[list[Outcome]]]]]] = deque()
         try:
-            made, every = [], iter(plan)
-            for done, part in enumerate(pool.map(lambda item: outcomes(*item), work), start=1):
-                made += part
-                if self._progress is not None:
-                    self._progress(self._done * len(work) + done, self._tables * len(work))
-                if done in last:
-                    of_range = next(every)
-                    self._cost.add(0.0, made)
-                    names = list(of_range.experiment.configurations)
-                    accuracy = of_range.experiment.measure.accuracy
-                    yield of_range, log_tables(of_range.log.name, made, names, accuracy=accuracy)
-                    made = []
+            for of_range in plan:
+                replay, alone = of_range.log.replay(), of_range.experiment
+                cut = blocks(replay, alone, self._jobs, of_range.runs)
+                waiting.append((of_range, [(len(b), pool.submit(outcomes, replay, alone, b)) for b in cut]))
+                while sum(len(parts) for _, parts in waiting) > self._jobs:
+                    yield self._ended(*waiting.popleft())
+            while waiting:
+                yield self._ended(*waiting.popleft())
         finally:  # interrupted: what has not begun never does
             pool.shutdown(cancel_futures=True)
             self._cost.add(time.perf_counter() - began_s, ())
-        self._done += 1
+
+    def _ended(self, of_range: _Range, parts: Sequence[tuple[int, Future[list[Outcome]]]]) -> tuple[_Range, LogTables]:
+        """The tables of a range, waited for."""
+        made = []
+        for runs, part in parts:
+            made += part.result()
+            self._went(runs)
+        if of_range.last:
+            of_range.log.drop()
+        self._cost.add(0.0, made)
+        names, accuracy = list(of_range.experiment.configurations), of_range.experiment.measure.accuracy
+        return of_range, log_tables(of_range.log.name, made, names, accuracy=accuracy)
+
+    def _went(self, runs: int) -> None:
+        self._done += runs
+        if self._progress is not None:
+            self._progress(self._done, self._runs)
 
     def _joined(
         self, log: StudyLog, experiment: Experiment, found: dict[tuple[str, str, tuple[int, int]], LogTables]

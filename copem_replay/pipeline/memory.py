@@ -6,6 +6,7 @@ import re
 import resource
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -30,11 +31,25 @@ ABOUT_BYTES = {False: (1000, 0), True: (3000, 45)}
 """
 
 
-def memory_notes(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
-    """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do."""
+Size: TypeAlias = tuple[int, float]
+"""Of a log: rows of a run, and, with accuracy, about how many lists the stays of these rows have."""
+
+
+def size_of(replay: Replay) -> Size:
+    """How much a log gives."""
+    written = replay.expanded.written
+    lists = _lists_a_run(replay) if written.measure.accuracy else 0.0
+    return len(replay.episodes.object_ix) * len(written.configurations), lists
+
+
+def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequence[Size] = ()) -> list[str]:
+    """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do.
+
+    `others`: sizes of further logs.
+    """
     accuracy, free = experiment.measure.accuracy, free_bytes()
-    rows_a_run = sum(len(r.episodes.object_ix) * len(r.expanded.written.configurations) for r in ready)
-    lists_a_run = sum(map(_lists_a_run, ready)) if accuracy else 0.0
+    sizes = [*map(size_of, ready), *others]
+    rows_a_run, lists_a_run = sum(rows for rows, _ in sizes), sum(lists for _, lists in sizes)
     about, least = (
         round(rows_a_run * row[accuracy][0] + lists_a_run * row[accuracy][1]) for row in (ABOUT_BYTES, AT_LEAST_BYTES)
     )

@@ -63,7 +63,8 @@ def run(
     """
     with watched() as cost:
         if ready is None and pieces is None:
-            ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in recordings]
+            read = [recording for recording in recordings if recording.survey is None]
+            ready = [prepare(recording, of_log(experiment, recording.scene.log)) for recording in read]
             check_closed_form(ready, experiment)
             memory_notes(ready, experiment)
         by_name = {replay.scene.log: replay for replay in ready or ()}

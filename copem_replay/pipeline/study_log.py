@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -35,6 +35,7 @@ class StudyLog:
     experiment: Experiment
     pieces: Pieces | None = None
     ready: Replay | None = None
+    _whole: Recording | None = None  # while a log that does not stay in memory is there
     _facts: tuple[Experiment, Facts] | None = None  # those that were asked for last
 
     @property
@@ -45,19 +46,26 @@ class StudyLog:
     def replay(self) -> Replay:
         """The log made ready."""
         if self.ready is None:
-            self.recording = whole(self.recording)
-            self.ready = prepare(self.recording, of_log(self.experiment, self.name))
+            self.ready = prepare(self.whole(), of_log(self.experiment, self.name))
         return self.ready
+
+    def whole(self) -> Recording:
+        """The recording with its truth and its lists."""
+        if self._whole is None:
+            self._whole = whole(self.recording)
+        return self._whole
+
+    def drop(self) -> None:
+        """Let go of what was read again: a log that stays in memory does, any other is read where it is needed."""
+        if self.recording.survey is not None:
+            self.ready = self._whole = None
 
     @cached_property
     def digests(self) -> Mapping[str, str]:
         """SHA-256 of the content, and of the truth."""
         if self.recording.survey is not None:
             return {name: self.recording.survey.said[name] for name in ("sha256", "truth")}
-        return {
-            "sha256": sha256_of(self.recording.place),
-            "truth": truth_digest(self.recording.scene, self.recording.truth),
-        }
+        return digests_of(self.recording)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -75,13 +83,13 @@ class StudyLog:
 
     def _found(self, alone: Experiment) -> Facts:
         if self.pieces is None:
-            return Facts.of(self.recording, self.replay(), alone)
+            return Facts.of(self.whole(), self.replay(), alone)
         about = survey_key(self.recording.place, alone)
         said = self.pieces.known(about)
         if said is not None and said["scene"]["log"] == self.name:
             return Facts.read(said["facts"])
         replay = self.replay()
-        found = Facts.of(self.recording, replay, alone)
+        found = Facts.of(self.whole(), replay, alone)
         self.pieces.keep(about, self._survey() | {"facts": found.as_json()})
         return found
 
@@ -89,6 +97,17 @@ class StudyLog:
         one = self.recording
         said = {"scene": scene_as_json(one.scene), "topic": one.topic, "notes": list(one.notes), "host": one.host_id}
         return said | dict(self.digests)
+
+
+def digests_of(recording: Recording) -> dict[str, str]:
+    """SHA-256 of the content of a recording that was read, and of its truth."""
+    return {"sha256": sha256_of(recording.place), "truth": truth_digest(recording.scene, recording.truth)}
+
+
+def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
+    """A recording without its truth and its lists, which are read again where they are needed."""
+    survey = Survey(digests_of(recording), read)
+    return replace(recording, truth=_nothing(), lists={}, around=None, lane_boundaries=(), survey=survey)
 
 
 def survey_key(place: Place, experiment: Experiment) -> str:

@@ -177,7 +177,7 @@ def _run_to_export(
 ) -> RunToExport:
     """One run of one log, in the configurations that the experiment shows."""
     of_study = next(one for one in result.logs if one.name == log)
-    replay, recording = of_study.replay(), of_study.recording
+    replay, recording = of_study.replay(), of_study.whole()
     experiment = of_log(experiment, log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
     names = list(chosen.configurations)

@@ -149,8 +149,10 @@ def run(
     >>> result.summary["ttd_median_s"].round(3).tolist()
     [0.0, 0.8, 0.0, 0.5, 1.0, 1.5]
     """
+    from copem_replay.pipeline.log_survey import LogSurvey
+
     kept = None if pieces is None else pieces_in(str(pieces))
-    study = study_of(experiment, recordings, kept)
+    study = study_of(experiment, recordings, LogSurvey(kept))
     return replayed(study, prepared(study)[0], jobs, progress, kept)
 
 

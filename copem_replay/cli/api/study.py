@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -18,7 +17,7 @@ from copem_replay.experiment.validate import across_logs, against_log, bound, lo
 from copem_replay.io.recording import Recording
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
-    from copem_replay.pipeline.pieces import Pieces
+    from copem_replay.pipeline.log_survey import LogSurvey
     from copem_replay.pipeline.prepare import Replay
 
 AnyPath: TypeAlias = str | PathLike[str]
@@ -36,6 +35,7 @@ class Study:
     experiment: Experiment
     recordings: tuple[Recording, ...]
     skipped: tuple[tuple[Path, str], ...] = ()
+    survey: LogSurvey | None = None
 
 
 def load_experiment(experiment: AnyExperiment) -> Experiment:
@@ -74,14 +74,16 @@ def _examined(source: Source, given: Experiment | None) -> tuple[Experiment | No
     return given, [*references(source), *log_paths(source)[1]]
 
 
-def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None, pieces: Pieces | None = None) -> Study:
+def study_of(
+    experiment: AnyExperiment, recordings: AnyRecordings | None = None, survey: LogSurvey | None = None
+) -> Study:
     """An experiment with its recordings: those it names (None), those at some paths, or those that are read already.
 
     Raises InputError with all problems of the experiment and of the recordings.
     """
     source, given = source_of(experiment)
     if recordings is None:
-        return read_study(source, given, pieces=pieces)
+        return read_study(source, given, survey=survey)
     listed = [recordings] if isinstance(recordings, Recording | str | PathLike) else list(recordings)
     paths = tuple(str(Path(one.path if isinstance(one, Recording) else one)) for one in listed)
     if not paths:
@@ -89,28 +91,23 @@ def study_of(experiment: AnyExperiment, recordings: AnyRecordings | None = None,
     source = with_logs(source, paths, "recordings")
     read = [one for one in listed if isinstance(one, Recording)]
     if not read:
-        return read_study(source, given, pieces=pieces)
+        return read_study(source, given, survey=survey)
     if len(read) < len(listed):
         raise InputError("recordings: expected either recordings or paths, found both")
     return _study_with(source, given, read)
 
 
 def read_study(
-    source: Source, given: Experiment | None = None, *, skip_unreadable: bool = False, pieces: Pieces | None = None
+    source: Source, given: Experiment | None = None, *, skip_unreadable: bool = False, survey: LogSurvey | None = None
 ) -> Study:
-    """Read the recordings of an experiment, but those that are known to `pieces`.
+    """Read the recordings of an experiment, but those that are known to the survey, which says what stays in memory.
 
     Raises InputError with every problem of it and of them.
     """
     experiment, found = _examined(source, given)
     if experiment is None:
         raise ExperimentError(found)
-    known = None
-    if pieces is not None:
-        from copem_replay.pipeline.study_log import known_log
-
-        known = partial(known_log, pieces)
-    recordings, refused = read_logs(experiment, log_paths(source)[0], source, known)
+    recordings, refused = read_logs(experiment, log_paths(source)[0], source, survey)
     if not recordings and not refused and not found:
         found.append(source.at(("logs",), "expected at least one recording, found none"))
     if not skip_unreadable or not recordings:
@@ -119,7 +116,7 @@ def read_study(
     if found:
         raise InputError(found)
     experiment = bound(experiment, recordings, source)
-    return Study(source, experiment, tuple(recordings), tuple((log.path, log.reason) for log in refused))
+    return Study(source, experiment, tuple(recordings), tuple((log.path, log.reason) for log in refused), survey)
 
 
 def _study_with(source: Source, given: Experiment | None, recordings: Sequence[Recording]) -> Study:
@@ -182,7 +179,9 @@ def prepared(study: Study) -> tuple[list[Replay], list[str]]:
             from copem_replay.pipeline.run import check_closed_form
 
             check_closed_form(ready, study.experiment)
+            if study.survey is not None and study.survey.problems:
+                raise ExperimentError(study.survey.problems)
         key = ("runs",)
-        return ready, memory_notes(ready, study.experiment)
+        return ready, memory_notes(ready, study.experiment, study.survey.sizes if study.survey is not None else ())
     except ExperimentError as error:
         raise ExperimentError([study.source.at(key, problem) for problem in error.problems]) from None
