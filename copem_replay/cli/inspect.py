@@ -122,7 +122,7 @@ def schema() -> int:
 def source_with(
     path: Path,
     changes: Mapping[str, object],
-    logs: Sequence[Path],
+    logs: Sequence[str],
     window_s: tuple[float | None, float | None],
 ) -> Source:
     """The experiment file, with the options that are given in the place of its keys."""
@@ -141,4 +141,4 @@ def source_with(
         options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
     data = without_settings(source.data, [key for key in ("ego", "window_s") if key in given])
     source = replace(source, data=data | given, options=options)
-    return with_logs(source, [str(log) for log in logs]) if logs else source
+    return with_logs(source, logs) if logs else source

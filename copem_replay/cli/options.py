@@ -13,7 +13,7 @@ LogFiles: TypeAlias = Annotated[
     list[Path], typer.Argument(metavar="LOG", help="Recordings: MCAP files, rosbag2 folders, .osi files.")
 ]
 Logs: TypeAlias = Annotated[
-    list[Path] | None,
+    list[str] | None,
     typer.Option("--log", metavar="FILE", help="Use this recording instead of those in the experiment."),
 ]
 Ego: TypeAlias = Annotated[str | None, typer.Option("--ego", metavar="ID", help="Id of the ego vehicle.")]

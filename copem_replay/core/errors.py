@@ -15,6 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from copem_replay.core.remote import Remote
 
 
 def printable(text: str) -> str:
@@ -76,7 +80,7 @@ class RecordingError(InputError):
         self,
         reasons: str | Sequence[str],
         *,
-        path: Path | None = None,
+        path: Path | Remote | None = None,
         topic: str | None = None,
         key: tuple[str | int, ...] = (),
     ) -> None:
@@ -84,7 +88,7 @@ class RecordingError(InputError):
         self.path, self.topic, self.key = path, topic, key
         super().__init__(self._lines(path, topic))
 
-    def _lines(self, path: Path | None, topic: str | None) -> list[str]:
+    def _lines(self, path: Path | Remote | None, topic: str | None) -> list[str]:
         where = "".join(f"{place}: " for place in (path, topic, self._about) if place is not None)
         return [f"{where}{reason}" for reason in self.reasons]
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import PurePosixPath
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from copem_replay.core.errors import CopemError, InputError
 
@@ -77,6 +78,11 @@ class Remote:
 def is_url(text: str) -> bool:
     """Whether this is a URL, not a path."""
     return _SCHEME.match(text) is not None
+
+
+def local_path(text: str) -> str:
+    """A path as it is, and that of a `file://` URL, which is on this machine."""
+    return unquote(urlsplit(text).path) if text.lower().startswith("file://") else text
 
 
 def bare(url: str) -> str:

@@ -7,15 +7,19 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 from pydantic import ValidationError
 
-from copem_replay.core.errors import ExperimentError
+from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.core.remote import Remote, bare, is_url, local_path, matches
 from copem_replay.core.yaml import AliasesError, Key, NotYamlError, read
 from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.shape_problems import by_key
-from copem_replay.io.together import Place, Together
+from copem_replay.io.together import File, Place, Together, first_of
+
+Listed: TypeAlias = dict[str, list[File] | InputError]
+"""What URLs match, or why they cannot be asked, by the URL: asked once."""
 
 
 class Problem(str):
@@ -40,6 +44,7 @@ class Source:
     problems: tuple[str, ...]  # of its YAML: the file is refused, but the rest is checked all the same
     logs: tuple[str, ...] = ()  # to replay instead of those it names, relative to where we are
     options: Mapping[Key, str] = field(default_factory=dict)  # of the command line: keys that they have set
+    listed: Listed = field(default_factory=dict)
 
     @property
     def logs_option(self) -> str:
@@ -141,6 +146,9 @@ def log_paths(source: Source) -> tuple[dict[Place, Key | None], list[str]]:
     problems: list[str] = []
     for k, (key, pattern, named) in _patterns(source).items():
         found = _places(source, k, pattern)
+        if why := _unasked(source, k, pattern):
+            problems.append(f"{source.logs_option}: {why}" if source.logs else source.at(key, why))
+            continue
         paths |= dict.fromkeys(found, None if source.logs else ("logs", k))
         if not found and source.logs:
             problems.append(f"{source.logs_option}: no file matches {pattern!r}")
@@ -162,10 +170,19 @@ def named_paths(source: Source) -> Iterator[tuple[str, Place]]:
 def _places(source: Source, k: int, pattern: str | None) -> list[Place]:
     """What an entry of `logs` names: files that match, or several recordings as one."""
     if pattern is not None:
-        return list(matching(pattern, folder_of(source)))
+        return list(matching(pattern, folder_of(source), source.listed))
     entry = source.data["logs"][k]
     offsets = entry.get("clock_offset_s")
     return [together(entry["together"], offsets if isinstance(offsets, dict) else {}, folder_of(source))]
+
+
+def _unasked(source: Source, k: int, pattern: str | None) -> str | None:
+    """Why nobody can tell what an entry of `logs` names."""
+    if pattern is None:
+        elsewhere = filter(is_url, source.data["logs"][k]["together"])
+        return next((f"expected recordings on this machine, found {bare(url)}" for url in elsewhere), None)
+    why = source.listed.get(pattern)
+    return why.problems[0] if isinstance(why, InputError) else None
 
 
 def together(names: Sequence[str], offset_s: Mapping[str, object], folder: Path) -> Together:
@@ -199,29 +216,36 @@ def entries_of(experiment: Experiment, source: Source) -> tuple[str | LogSetting
     for k, (_, pattern, _) in _patterns(source).items():
         entry = experiment.logs[k]
         for place in _places(source, k, pattern):
-            alone = str(place) if isinstance(entry, str) else at_place(entry, place)
+            alone = at_place(entry, place) if isinstance(entry, LogSettings) else address(first_of(place))
             entries.setdefault(place, alone)
     return tuple(entries.values())
 
 
-def at_place(entry: LogSettings, place: Place, called: Callable[[Path], str] = str) -> LogSettings:
+def address(file: File) -> str:
+    """What leads to a recording: a path, or a URL with all that lets us in."""
+    return file.url if isinstance(file, Remote) else str(file)
+
+
+def at_place(entry: LogSettings, place: Place, called: Callable[[File], str] = address) -> LogSettings:
     """The settings of a recording, or of several as one, that lie elsewhere, or are called otherwise."""
-    if isinstance(place, Path):
+    if not isinstance(place, Together):
         return entry.model_copy(update={"file": called(place)})
     names = tuple(called(path) for path in place.paths)
     offsets = {name: ahead_s for name, ahead_s in zip(names, place.ahead_s, strict=True) if ahead_s}
     return entry.model_copy(update={"together": names} | ({"clock_offset_s": offsets} if offsets else {}))
 
 
-def places_of(entry: LogSettings, folder: Path) -> list[Place]:
+def places_of(entry: LogSettings, folder: Path, listed: Listed | None = None) -> list[Place]:
     """The recordings that settings are for."""
     if entry.file is not None:
-        return list(matching(entry.file, folder))
+        return list(matching(entry.file, folder, listed))
     return [together(entry.together or (), entry.clock_offset_s, folder)]
 
 
 def identity(place: Place) -> str:
     """The same for the same recordings, whatever leads there."""
+    if isinstance(place, Remote):
+        return place.url
     return os.path.realpath(place) if isinstance(place, Path) else "\n".join(map(os.path.realpath, place.paths))
 
 
@@ -238,12 +262,12 @@ def with_logs(source: Source, paths: Sequence[str], option: str = "--log") -> So
     ]
     entries: list[object] = []
     for path in paths:
-        real = os.path.realpath(path)
+        real = path if is_url(path) else os.path.realpath(path)
         same = (
             entry
             for entry, pattern in mine
             if isinstance(pattern, str)
-            and any(os.path.realpath(found) == real for found in matching(pattern, source.path.parent))
+            and any(identity(found) == real for found in matching(pattern, source.path.parent, source.listed))
         )
         entries.append({**entry, "file": path} if (entry := next(same, None)) is not None else path)
     options = dict(source.options) | ({("logs",): option} if option != "--log" else {})
@@ -259,15 +283,29 @@ def without_settings(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any
     return data | {"logs": bare}
 
 
-def matching(pattern: str, folder: Path) -> list[Path]:
-    """The files a path relative to `folder` names, sorted; a path without wildcards names itself, there or not."""
+def matching(pattern: str, folder: Path, listed: Listed | None = None) -> list[File]:
+    """The files a path relative to `folder`, or a URL, names, sorted; without wildcards it names itself, there or not.
+
+    `listed`: what URLs were found to match, or why they cannot be asked.
+    """
+    if is_url(pattern := local_path(pattern)):
+        listed = {} if listed is None else listed
+        if pattern not in listed:
+            try:
+                listed[pattern] = list(matches(pattern))
+            except InputError as error:
+                listed[pattern] = error
+        found = listed[pattern]
+        return [] if isinstance(found, InputError) else found
     if is_there(folder / pattern) or not glob.has_magic(pattern):
         return [folder / pattern]
     return [folder / name for name in sorted(glob.glob(pattern, root_dir=folder, recursive=True))]
 
 
 def is_there(place: Place) -> bool:
-    """Whether there is something of this name; a name no file can have is none."""
+    """Whether there is something of this name; a name no file can have is none. Raises InputError."""
+    if isinstance(place, Remote):
+        return place.there is not None
     if isinstance(place, Together):
         return all(map(is_there, place.paths))
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,8 +11,10 @@ from pathlib import Path
 from typing import Protocol
 
 from copem_replay.core.errors import EgoError, InputError, RecordingError, printable
+from copem_replay.core.remote import Remote
 from copem_replay.core.text import unknown
 from copem_replay.core.yaml import Key
+from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.cross_references import NO_EGO, references
 from copem_replay.experiment.drive import SettingsError, of_log, with_settings
 from copem_replay.experiment.file import (
@@ -28,21 +31,20 @@ from copem_replay.experiment.file import (
 )
 from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.experiment.shape_problems import by_key
+from copem_replay.io.checksum import sha256_of
 from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of
 from copem_replay.io.recorded_output import recorded_output
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
-from copem_replay.io.together import Place, Together, first_of
-from copem_replay.metrics.onset import Requires
-from copem_replay.perception.config import Carriers
+from copem_replay.io.together import File, Local, Place, at_hand, files_of, first_of
 
 
 @dataclass(frozen=True)
 class Refused:
     """A log that cannot be replayed, and why. `key`: what the experiment asks of it in vain."""
 
-    path: Path
+    path: File
     reason: str
     key: Key | None = None
 
@@ -89,15 +91,20 @@ def place_of(path: Path) -> Path:
     return Path(os.path.realpath(path.parent)) / path.name
 
 
-def log_names(paths: Sequence[Path]) -> list[str]:
+def log_names(paths: Sequence[File]) -> list[str]:
     """A name per log: the name of its file or folder, made unique by its folder where two are alike."""
-    whole = [place_of(path).relative_to("/") for path in paths]
-    bare = [path.parent / name_of(Path("/", path)) for path in whole]
-    bare = [short if bare.count(short) == 1 else path for short, path in zip(bare, whole, strict=True)]
+    whole = [(path.path if isinstance(path, Remote) else place_of(path)).relative_to("/") for path in paths]
+    bare = [
+        path.parent / (path.stem if isinstance(of, Remote) else name_of(Path("/", path)))
+        for of, path in zip(paths, whole, strict=True)
+    ]
+    count = Counter(bare)
+    bare = [short if count[short] == 1 else path for short, path in zip(bare, whole, strict=True)]
     depth = [1] * len(paths)
     while True:
         names = ["/".join(path.parts[-d:]) for path, d in zip(bare, depth, strict=True)]
-        again = [names.count(name) > 1 and d < len(p.parts) for name, p, d in zip(names, bare, depth, strict=True)]
+        alike = Counter(names)
+        again = [alike[name] > 1 and d < len(p.parts) for name, p, d in zip(names, bare, depth, strict=True)]
         if not any(again):
             return names
         depth = [d + twice for d, twice in zip(depth, again, strict=True)]
@@ -129,9 +136,8 @@ def read_logs(
     names_of = _named(source) if source is not None and isinstance(paths, Mapping) else {}
     mine = settings_by_place(experiment, source)
     for path, key in keys.items():
-        if not is_there(path):
-            gone = (one for one in (path.paths if isinstance(path, Together) else (path,)) if not is_there(one))
-            refused.append(Refused(next(gone), "no such file", key))
+        if (gone := _gone(path, key)) is not None:
+            refused.append(gone)
         elif (place := identity(path)) not in recordings:
             entry, settings = mine.get(place, (None, None))
             alone = experiment if settings is None else with_settings(experiment, settings)
@@ -151,6 +157,17 @@ def read_logs(
     return _with_names(recordings, given), refused
 
 
+def _gone(place: Place, key: Key | None) -> Refused | None:
+    """A recording that is not there, or that cannot be asked for."""
+    for one in files_of(place):
+        try:
+            if not is_there(one):
+                return Refused(one, "no such file", key)
+        except InputError as error:
+            return Refused(one, error.problems[0].removeprefix(f"{one}: "), key)
+    return None
+
+
 def _again(experiment: Experiment, place: Place) -> Recording:
     """A recording that could be read before. Raises InputError where it no longer can."""
     recording, wrong = _read(experiment, place)
@@ -163,18 +180,18 @@ def _with_names(recordings: Mapping[str, Recording], given: Mapping[str, str]) -
     """The recordings, by where they lie, as logs of their own names, or of those that are `given`."""
     unnamed = {place: recording for place, recording in recordings.items() if place not in given}
     names = dict(given)
-    names |= zip(unnamed, log_names([recording.path for recording in unnamed.values()]), strict=True)
+    names |= zip(unnamed, log_names([first_of(recording.place) for recording in unnamed.values()]), strict=True)
     return [replace(r, scene=replace(r.scene, log=names[place])) for place, r in recordings.items()]
 
 
 def settings_by_place(experiment: Experiment, source: Source | None) -> dict[str, tuple[int, LogSettings]]:
     """The entries of `logs` that are mappings, and their numbers, by where the recordings lie."""
-    folder = Path() if source is None else folder_of(source)
+    folder, listed = (Path(), None) if source is None else (folder_of(source), source.listed)
     return {
         identity(place): (k, entry)
         for k, entry in enumerate(experiment.logs)
         if isinstance(entry, LogSettings)
-        for place in places_of(entry, folder)
+        for place in places_of(entry, folder, listed)
     }
 
 
@@ -194,13 +211,29 @@ def _named(source: Source) -> dict[str, list[str]]:
     """By what each file is named in an experiment, or by options: `logs[0]`, `--log`."""
     names: dict[str, list[str]] = {}
     for name, place in named_paths(source):
-        if is_there(place):
+        if isinstance(place, Remote) or is_there(place):
             names.setdefault(identity(place), []).append(name)
     return names
 
 
 def _read(experiment: Experiment, place: Place) -> tuple[Recording | None, list[Refused]]:
-    path = first_of(place)
+    """A recording, and what is wrong with it. What lies elsewhere is on this machine only meanwhile."""
+    if not isinstance(place, Remote):
+        return _read_here(experiment, place)
+    if (place.there or {}).get("type") == "directory":
+        return None, [Refused(place, "expected a file, found a folder; a rosbag2 folder is read on this machine only")]
+    try:
+        with at_hand(place) as here:
+            recording, wrong = _read_here(experiment, here)
+            if recording is not None:
+                recording = replace(recording, remote=place, sha256=sha256_of(here))
+    except InputError as error:
+        return None, [Refused(place, line.removeprefix(f"{place}: ")) for line in error.problems]
+    return recording, [replace(one, path=place, reason=one.reason.replace(str(here), str(place))) for one in wrong]
+
+
+def _read_here(experiment: Experiment, place: Local) -> tuple[Recording | None, list[Refused]]:
+    path = place if isinstance(place, Path) else place.paths[0]
     try:
         str(place_of(path)).encode()
     except UnicodeEncodeError:
@@ -242,48 +275,9 @@ def _read(experiment: Experiment, place: Place) -> tuple[Recording | None, list[
             at = ("configurations", name, "recorded")
             wrong += [Refused(path, line, at) for line in error.within(path)]
     recording = replace(recording, lists=lists, notes=tuple(notes))
-    return recording, wrong + [Refused(path, reason, key) for key, reason in against_log(experiment, recording, wrong)]
-
-
-def against_log(
-    experiment: Experiment, recording: Recording, known: Sequence[Refused] = ()
-) -> Iterator[tuple[Key, str]]:
-    """Problems of an experiment with one log, beside `known` ones: no ego, carriers that are not in it."""
-    scene = recording.scene
-    none = scene.ego_ix < 0
-    if none and experiment.ego is None:
-        yield (
-            ("ego",),
-            f"no ego vehicle in this log{_host(recording)}; give `ego: <object id>` or --ego ID "
-            f"({moving_ids(scene)}), or `ego: none` with `distance_to: <unit>`",
-        )
-    if experiment.braking is not None and not none and not scene.ego_sized:
-        yield ("braking",), "the size of the ego is not known; give `ego: {topic: …, size_m: [length, width, height]}`"
-    studied = not none or experiment.ego != NO_EGO  # an ego that is sought and not there is said once
-    if not studied and experiment.measure.distance_to == "ego":
-        yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"
-    within = experiment.measure.objects.within
-    if not studied and within is not None and within.of_ego:
-        yield ("measure", "objects", "within"), "no ego in this study, whose way it could be; give `polygon_m`"
-    for name, unit in experiment.units.items():
-        if unit.on == "ego":
-            if not studied:
-                yield ("units", name, "on"), "no ego in this study to carry the unit"
-        elif isinstance(unit.on, Carriers):
-            taken = [one for one in scene.object_ids if f"{name}:{one}" in experiment.units]
-            if taken:
-                yield ("units", f"{name}:{taken[0]}"), f"that is what {name} is called on object {taken[0]}"
-        elif unit.on is not None and unit.on not in scene.object_number:
-            yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
-    onset = experiment.measure.onset
-    if onset.requires is not Requires.UNIT_ON_EGO or known:
-        return
-    if not studied:
-        yield ("measure", "onset"), f"{onset.kind} is the ego's; without an ego use line_of_sight_any"
-    elif not none:
-        on_ego = ("ego", scene.object_ids[scene.ego_ix])
-        if not any(unit.on in on_ego for unit in experiment.units.values()):
-            yield ("measure", "onset"), f"{onset.kind} needs a unit on the ego; or use line_of_sight_any"
+    return recording, wrong + [
+        Refused(path, reason, key) for key, reason in against_log(experiment, recording, known=bool(wrong))
+    ]
 
 
 def across_logs(experiment: Experiment, recordings: Sequence[Recording], source: Source | None) -> Iterator[str]:
@@ -319,9 +313,3 @@ def across_logs(experiment: Experiment, recordings: Sequence[Recording], source:
     for k, wanted in enumerate(experiment.show.logs if experiment.show else ()):
         if names and wanted not in ("first", "all", *names):
             yield at(("show", "logs", k), unknown("log", wanted, ["first", "all", *names]))
-
-
-def _host(recording: Recording) -> str:
-    if recording.host_id is None:
-        return " (host_vehicle_id is not set)"
-    return f" (its host_vehicle_id {recording.host_id!r} is no moving object of it)"

@@ -6,10 +6,10 @@ import hashlib
 
 from copem_replay.io.containers.rosbag2_metadata import files_of
 from copem_replay.io.log import open_file
-from copem_replay.io.together import Place, Together
+from copem_replay.io.together import Local, Together
 
 
-def sha256_of(at: Place) -> str:
+def sha256_of(at: Local) -> str:
     """Of a file; of a folder of rosbag2, or of several recordings, of the files one after the other, as `cat` has them.
 
     Raises RecordingError: it cannot be read, or the folder is none of rosbag2.

@@ -11,7 +11,7 @@ from copem_replay.io.containers.joined import Joined, open_joined
 from copem_replay.io.containers.osi_trace import is_trace, open_trace
 from copem_replay.io.containers.rosbag2 import open_bag
 from copem_replay.io.log import Log, open_mcap
-from copem_replay.io.together import Place, Together
+from copem_replay.io.together import Local, Together
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ CONTAINERS: Final = (
 """The first that takes a path opens it."""
 
 
-def open_log(place: Place) -> Log:
+def open_log(place: Local) -> Log:
     """Look at a recording, or at several as one. Raises RecordingError where nothing in one of them can be read."""
     return open_joined(place, _open_one) if isinstance(place, Together) else _open_one(place)
 

@@ -26,14 +26,14 @@ from copem_replay.io.recorded_osi import RecordedLists, as_tracks, in_time, read
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.registry import known_lists
-from copem_replay.io.together import Place
+from copem_replay.io.together import Local
 from copem_replay.io.window import Window
 from copem_replay.io.world_frame import LogContext, in_world, lists_of, log_context
 from copem_replay.io.write.ros2_definitions import STRING
 
 
 def lists_on(
-    path: Place, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
 ) -> RecordedLists:
     """The lists on `topic` in whatever format, with what their messages say and nothing else. Raises RecordingError."""
     return read_listed(path, topic, scene, around, window) or read_recorded(path, topic, scene, window)
@@ -41,7 +41,7 @@ def lists_on(
 
 @np.errstate(over="ignore", invalid="ignore")
 def read_listed(
-    path: Place, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
 ) -> RecordedLists | None:
     """The lists on `topic`, in the world of the truth; None: none of a known format is there. Raises RecordingError."""
     log = open_log(path).within(window)

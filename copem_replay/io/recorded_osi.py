@@ -22,7 +22,7 @@ from copem_replay.io.open import open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import LAST_NS
 from copem_replay.io.schemas.registry import known_lists
-from copem_replay.io.together import Place
+from copem_replay.io.together import Local
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write import osi_sensor_data as sensor_data
@@ -49,7 +49,7 @@ class _Rows:
     logged: list[int] = field(default_factory=list)
 
 
-def read_lists(path: Place, topic: str, scene: Scene) -> Tracks:
+def read_lists(path: Local, topic: str, scene: Scene) -> Tracks:
     """The lists on `topic`, their objects told by the ids of `scene` (−1 where the list names no object of it).
 
     Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
@@ -78,7 +78,7 @@ class RecordedLists:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def read_recorded(path: Place, topic: str, scene: Scene, window: Window | None = None) -> RecordedLists:
+def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None = None) -> RecordedLists:
     """The lists on `topic` with all they say, but ids of the truth. Raises RecordingError as `read_lists`."""
     rows, _ = _all_rows(path, topic, window)
     stamps = np.array(rows.stamps, dtype=np.int64).reshape(-1, 2)
@@ -117,7 +117,7 @@ def read_recorded(path: Place, topic: str, scene: Scene, window: Window | None =
     )
 
 
-def _all_rows(path: Place, topic: str, window: Window | None = None) -> tuple[_Rows, dict[int, dict[str, Any]]]:
+def _all_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_Rows, dict[int, dict[str, Any]]]:
     log = open_log(path).within(window)
     try:
         return _read(log, topic)

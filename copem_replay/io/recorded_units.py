@@ -62,7 +62,7 @@ class RecordedUnits:
 
 def as_recorded(recording: Recording, topic: str) -> RecordedLists:
     """The lists on a topic with what their messages say, and nothing else. Raises RecordingError."""
-    return lists_on(recording.place, topic, recording.scene, recording.around, recording.window)
+    return lists_on(recording.local, topic, recording.scene, recording.around, recording.window)
 
 
 def recorded_unit(

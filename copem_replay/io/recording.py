@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from copem_replay.core.errors import EgoError, RecordingError, printable
+from copem_replay.core.remote import Remote
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
@@ -24,7 +25,7 @@ from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.decoded import DecodedObjects
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list, known_lists, names_objects
-from copem_replay.io.together import Place, Together
+from copem_replay.io.together import Local, Place, Together
 from copem_replay.io.window import Window, WindowSeconds, cut_out, window_notes
 
 if TYPE_CHECKING:  # they import much that a look at a recording of OSI does not need
@@ -64,21 +65,30 @@ class Recording:
     window: Window | None = None  # of log time, that was read; None: all
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
     together: Together | None = None  # the recordings of the drive, `path` being the first; None: it is one
+    remote: Remote | None = None  # where it lies, if not on this machine: `path` was a copy
+    sha256: str | None = None  # of that copy
     survey: Survey | None = None  # where it was not read, but is known from before: no truth, no lists (`survey.whole`)
 
     @property
     def place(self) -> Place:
-        """Where it lies: a file or folder, or several."""
+        """Where it lies: a file or folder, or several, or under a URL."""
+        return self.remote or self.local
+
+    @property
+    def local(self) -> Local:
+        """What it was read from on this machine."""
         return self.path if self.together is None else self.together
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files or folders it is read from."""
+        """The files or folders of this machine that it is read from."""
+        if self.remote is not None:
+            return ()
         return (self.path,) if self.together is None else self.together.paths
 
 
 def read(
-    path: Place | str,
+    path: Local | str,
     *,
     name: str,
     ego: str | EgoTopic | None = None,

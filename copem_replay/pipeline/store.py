@@ -10,10 +10,10 @@ import tempfile
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import unquote, urlsplit
+from urllib.parse import urlsplit
 
 from copem_replay.core.errors import InputError, OutputError
-from copem_replay.core.remote import bare, file_system, in_one_line, is_url
+from copem_replay.core.remote import bare, file_system, in_one_line, is_url, local_path
 
 _SAID = "--pieces: "
 MARK = "pieces.txt"
@@ -43,9 +43,9 @@ class Store(Protocol):
 
 def store_at(address: str | Path) -> Store:
     """The store in a folder, or under a URL. Raises InputError, OutputError."""
-    if isinstance(address, str) and address.lower().startswith("file://"):
-        address = Path(unquote(urlsplit(address).path))
-    return Bucket(address) if isinstance(address, str) and is_url(address) else Folder(Path(address))
+    if isinstance(address, Path) or not is_url(address := local_path(address)):
+        return Folder(Path(address))
+    return Bucket(address)
 
 
 class Folder:

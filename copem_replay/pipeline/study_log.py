@@ -6,10 +6,13 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
+from copem_replay.core.remote import Remote
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
@@ -17,7 +20,7 @@ from copem_replay.io.checksum import sha256_of
 from copem_replay.io.containers.rosbag2_metadata import files_of
 from copem_replay.io.recording import Recording
 from copem_replay.io.survey import Survey, whole
-from copem_replay.io.together import Place, Together
+from copem_replay.io.together import Place, Together, first_of
 from copem_replay.io.truth_digest import truth_digest
 from copem_replay.pipeline.facts import Facts, scene_as_json, scene_of
 from copem_replay.pipeline.pieces import Pieces
@@ -101,7 +104,8 @@ class StudyLog:
 
 def digests_of(recording: Recording) -> dict[str, str]:
     """SHA-256 of the content of a recording that was read, and of its truth."""
-    return {"sha256": sha256_of(recording.place), "truth": truth_digest(recording.scene, recording.truth)}
+    sha256 = recording.sha256 or sha256_of(recording.local)
+    return {"sha256": sha256, "truth": truth_digest(recording.scene, recording.truth)}
 
 
 def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
@@ -112,20 +116,27 @@ def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
 
 def survey_key(place: Place, experiment: Experiment) -> str:
     """All that is known of a log depends on: its files as they are now, and the experiment, resolved for it."""
-    paths = place.paths if isinstance(place, Together) else (place,)
-    files = [file for path in paths for file in (files_of(path) if path.is_dir() else [path])]
-    stats = [(os.path.realpath(file), os.stat(file)) for file in files]
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
     return canonical(
         {
             "survey": 1,
             "fingerprint": fingerprint(),
             "own": sources(experiment),
-            "files": [(file, stat.st_size, stat.st_mtime_ns) for file, stat in stats],
+            "files": _stamps(place),
             "ahead_ns": place.ahead_ns if isinstance(place, Together) else (),
             "experiment": data,
         }
     )
+
+
+def _stamps(place: Place) -> list[tuple[object, ...]]:
+    """Which files they are, their sizes, and what changes with their content."""
+    if isinstance(place, Remote):  # which is not asked for a content that it does not tell from another
+        return [(str(place), *(place.stamp or (uuid4().hex,)))]
+    paths = place.paths if isinstance(place, Together) else (place,)
+    files = [file for path in paths for file in (files_of(path) if path.is_dir() else [path])]
+    stats = [(os.path.realpath(file), os.stat(file)) for file in files]
+    return [(file, stat.st_size, stat.st_mtime_ns) for file, stat in stats]
 
 
 def known_log(pieces: Pieces, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
@@ -133,10 +144,11 @@ def known_log(pieces: Pieces, place: Place, experiment: Experiment, read: Callab
     said = pieces.known(survey_key(place, experiment))
     if said is None:
         return None
-    path, together = (place.paths[0], place) if isinstance(place, Together) else (place, None)
+    together, remote = place if isinstance(place, Together) else None, place if isinstance(place, Remote) else None
+    first = first_of(place)
     return Recording(
-        scene_of(said["scene"]), _nothing(), path, said["topic"], tuple(said["notes"]), said["host"],
-        together=together, survey=Survey(said, read),
+        scene_of(said["scene"]), _nothing(), Path(first.name) if isinstance(first, Remote) else first, said["topic"],
+        tuple(said["notes"]), said["host"], together=together, remote=remote, survey=Survey(said, read),
     )  # fmt: skip
 
 

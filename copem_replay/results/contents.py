@@ -11,12 +11,13 @@ from typing import Any
 
 import pandas as pd
 
+from copem_replay.core.remote import Remote
 from copem_replay.experiment.file import at_place
 from copem_replay.experiment.schema import LogSettings
 from copem_replay.experiment.validate import place_of
-from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
-from copem_replay.io.truth_digest import truth_digest
+from copem_replay.io.together import File, first_of
+from copem_replay.pipeline.study_log import digests_of
 
 _LIBRARIES = (
     "foxglove-schemas-protobuf", "mcap", "numba", "numpy", "osi-python", "pandas", "protobuf", "pyarrow", "rerun-sdk",
@@ -29,14 +30,19 @@ ROWS_A_GROUP = 1 << 20
 def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
     """`logs` as the folder has it: a path relative to it each, with the log's settings where it has some."""
 
-    def called(path: Path) -> str:
-        return os.path.relpath(place_of(path), folder)
+    def called(file: File) -> str:
+        return written_name(file, folder)
 
     settings = [entry for entry in logs if isinstance(entry, LogSettings)]
     if len(settings) < len(recordings):
-        return [called(recording.path) for recording in recordings]
+        return [called(first_of(recording.place)) for recording in recordings]
     moved = (at_place(one, r.place, called) for one, r in zip(settings, recordings, strict=True))
     return [one.model_dump(mode="json", by_alias=True) for one in moved]
+
+
+def written_name(file: File, folder: Path) -> str:
+    """What results in a folder call a recording: its path from there, or its URL without what lets us in."""
+    return str(file) if isinstance(file, Remote) else os.path.relpath(place_of(file), folder)
 
 
 def versions() -> dict[str, object]:
@@ -50,10 +56,7 @@ def versions() -> dict[str, object]:
 
 def said_of_logs(recordings: Sequence[Recording]) -> list[dict[str, object]]:
     """Which recordings they were, by their content."""
-    return [
-        {"log": r.scene.log, "topic": r.topic, "sha256": sha256_of(r.place), "truth": truth_digest(r.scene, r.truth)}
-        for r in recordings
-    ]
+    return [{"log": r.scene.log, "topic": r.topic, **digests_of(r)} for r in recordings]
 
 
 def write_parquet(table: Any, path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.io.recording import Recording
+from copem_replay.io.together import at_hand
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,18 +60,19 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
     from copem_replay.results.truth_scene import truth_scene
 
     recording = run.recording
-    return write_mcap(
-        path,
-        recording.place,
-        run.one.replay.scene,
-        run.one.run_tracks,
-        run.table,
-        run.manifest,
-        family_of(recording),
-        recording.window,
-        truth_scene(run.one, run.table),
-        configuration_colours(run.every),
-    )
+    with at_hand(recording.place) as here:
+        return write_mcap(
+            path,
+            here,
+            run.one.replay.scene,
+            run.one.run_tracks,
+            run.table,
+            run.manifest,
+            family_of(recording),
+            recording.window,
+            truth_scene(run.one, run.table),
+            configuration_colours(run.every),
+        )
 
 
 MCAP = Exporter(".mcap", _write_mcap)

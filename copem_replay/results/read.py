@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.core.remote import Remote, is_url
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.file import Source, load, parse, places_of
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.together import Place, first_of
+from copem_replay.io.together import File, Place, first_of
 from copem_replay.metrics.config import Measure
 from copem_replay.metrics.fixed import Fixed, fixed_in
 from copem_replay.results.belongings import MARK, check_still
@@ -198,9 +199,11 @@ class Results:
     def log_place(self, log: str) -> Place:
         """Where the recording of a log, or the several that it is made of, are expected."""
         entry = self.experiment.logs[[file.name for file in self.provenance.logs].index(log)]
-        return self.folder / entry if isinstance(entry, str) else places_of(entry, self.folder)[0]
+        if isinstance(entry, str):
+            return Remote(entry) if is_url(entry) else self.folder / entry
+        return places_of(entry, self.folder)[0]
 
-    def log_path(self, log: str) -> Path:
+    def log_path(self, log: str) -> File:
         """Where the recording of a log is expected."""
         return first_of(self.log_place(log))
 

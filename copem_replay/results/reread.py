@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from copem_replay.core.errors import RecordingError
+from copem_replay.core.errors import InputError, RecordingError
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.checksum import sha256_of
 from copem_replay.io.recording import Recording
+from copem_replay.io.together import at_hand
 from copem_replay.metrics.config import Objects
 from copem_replay.pipeline.prepare import Replay, prepare
 
@@ -40,8 +41,9 @@ def read_again(results: Results, log: str, experiment: Experiment) -> Recording:
     file = next(file for file in results.provenance.logs if file.name == log)
     path, place = results.log_path(log), results.log_place(log)
     try:
-        found = sha256_of(place)
-    except RecordingError as error:
+        with at_hand(place) as here:
+            found = sha256_of(here)
+    except InputError as error:
         raise RecordingError(f"{error}; put the log back to draw its runs") from None
     if found != file.sha256:
         raise RecordingError(

@@ -20,15 +20,15 @@ from copem_replay.core.errors import OutputError
 from copem_replay.core.yaml import dump
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import place_of
 from copem_replay.io.recording import Recording
+from copem_replay.io.together import File, files_of
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
 from copem_replay.pipeline.sweep import resolved
 from copem_replay.results import tables
 from copem_replay.results.belongings import MARK
-from copem_replay.results.contents import log_entries, versions, write_parquet
+from copem_replay.results.contents import log_entries, versions, write_parquet, written_name
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
 
@@ -42,7 +42,7 @@ def write_results(
     result: Result,
     *,
     exporters: Sequence[Exporter],
-    skipped: Sequence[tuple[Path, str]] = (),
+    skipped: Sequence[tuple[File, str]] = (),
     overwrite: bool = False,
 ) -> list[str]:
     """Write the results folder. Returns notes for the user. Raises OutputError.
@@ -63,7 +63,7 @@ def fill_place(
     result: Result,
     *,
     exporters: Sequence[Exporter],
-    skipped: Sequence[tuple[Path, str]] = (),
+    skipped: Sequence[tuple[File, str]] = (),
 ) -> list[str]:
     """The same into a place that is taken, whose `folder` and `notes` may change. Raises OutputError."""
     files = _files(experiment, recordings, result, exporters)
@@ -138,6 +138,7 @@ def _fill(
             run = _run_to_export(log, shown, experiment, recordings, result)
             said = [line for exporter in exporters for line in exporter.write(Path(f"{target}{exporter.suffix}"), run)]
             notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
+        next(one for one in result.logs if one.name == log).drop()
     return notes
 
 
@@ -149,13 +150,13 @@ def _recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
     return [one for one in found if isinstance(one, dict) and one.get("kind") == "recorded"]
 
 
-def _logs(folder: Path, result: Result, skipped: Sequence[tuple[Path, str]]) -> pd.DataFrame:
+def _logs(folder: Path, result: Result, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
     """The rows of `logs.csv`: what became of each log."""
     counts = result.table.groupby("log").size()
     rows = [
         {
             "log": log.name,
-            "path": _utf8(" + ".join(os.path.relpath(place_of(path), folder) for path in log.recording.paths)),
+            "path": _utf8(" + ".join(written_name(one, folder) for one in files_of(log.recording.place))),
             "sha256": log.digests["sha256"],
             "episodes": facts.episodes,
             "rows": int(counts.get(log.name, 0)),
@@ -164,7 +165,7 @@ def _logs(folder: Path, result: Result, skipped: Sequence[tuple[Path, str]]) -> 
         for log, facts in zip(result.logs, result.facts, strict=True)
     ]
     rows += [
-        {"log": None, "path": _utf8(os.path.relpath(place_of(path), folder)), "state": "skipped", "reason": _utf8(why)}
+        {"log": None, "path": _utf8(written_name(path, folder)), "state": "skipped", "reason": _utf8(why)}
         for path, why in skipped
     ]
     columns = {"log": "object", "path": "object", "sha256": "object", "episodes": "Int64", "rows": "Int64",
@@ -204,7 +205,7 @@ def provenance_of(
     experiment: Experiment,
     recordings: Sequence[Recording],
     result: Result,
-    skipped: Sequence[tuple[Path, str]],
+    skipped: Sequence[tuple[File, str]],
     notes: Sequence[str],
 ) -> dict[str, object]:
     """What made these results: versions, logs, seed, metric parameters; no clock, no host."""

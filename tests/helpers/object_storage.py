@@ -62,7 +62,7 @@ def moto(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]
 
 
 @pytest.fixture
-def bucket(moto: tuple[str, Path], monkeypatch: pytest.MonkeyPatch) -> Iterator[Bucket]:
+def bucket(moto: tuple[str, Path], monkeypatch: pytest.MonkeyPatch) -> Bucket:
     """An empty bucket, which this process and those it starts get to by their environment alone."""
     import fsspec.config
     import s3fs
@@ -78,8 +78,6 @@ def bucket(moto: tuple[str, Path], monkeypatch: pytest.MonkeyPatch) -> Iterator[
     for name, value in given.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": endpoint})  # fsspec looks at it when it is imported
-    s3fs.S3FileSystem.clear_instance_cache()
     fs, name = s3fs.S3FileSystem(), f"drives-{next(_NUMBERS)}"
     fs.mkdir(name)
-    yield Bucket(f"s3://{name}", endpoint, said, fs)
-    s3fs.S3FileSystem.clear_instance_cache()
+    return Bucket(f"s3://{name}", endpoint, said, fs)

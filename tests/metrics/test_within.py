@@ -10,8 +10,8 @@ import pytest
 import shapely
 
 from copem_replay.core.errors import ExperimentError
+from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import against_log
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.episodes import episodes
 from copem_replay.metrics.within import only_within

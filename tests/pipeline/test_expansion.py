@@ -24,8 +24,9 @@ from mcap.reader import make_reader
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Bool, Int
+from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.experiment.validate import against_log, problems
+from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.accuracy_tables import with_accuracy

@@ -11,9 +11,7 @@ import pytest
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.pipeline.store import MARK, store_at
-from tests.helpers.object_storage import Bucket, bucket, moto
-
-__all__ = ["bucket", "moto"]
+from tests.helpers.object_storage import Bucket
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "memory", "s3"])
@@ -81,7 +79,10 @@ def test_what_cannot_be_kept_is_said_in_one_line(bucket: Bucket, monkeypatch: py
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nowhere")
     monkeypatch.setenv("AWS_CONFIG_FILE", "/nowhere")
     type(bucket.fs).clear_instance_cache()
-    assert refused(f"{bucket.url}/kept") == f"--pieces: {bucket.url}/kept: Unable to locate credentials"
+    try:
+        assert refused(f"{bucket.url}/kept") == f"--pieces: {bucket.url}/kept: Unable to locate credentials"
+    finally:
+        type(bucket.fs).clear_instance_cache()
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from copem_replay.pipeline.run import Result
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from copem_replay.io.together import File
     from copem_replay.pipeline.pieces import Pieces
     from copem_replay.pipeline.prepare import Replay
     from copem_replay.results.place import Place
@@ -108,7 +109,7 @@ class StudyResult:
 
 
 def fill(
-    place: Place, result: StudyResult, *, skipped: Sequence[tuple[Path, str]] = (), viewer: str | None = None
+    place: Place, result: StudyResult, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None
 ) -> list[str]:
     """Write results into a place that is taken. Returns what has to be said of them.
 

@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.core.remote import is_url
+from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.cross_references import NO_EGO, references
 from copem_replay.experiment.drive import of_log
-from copem_replay.experiment.file import Source, entries_of, load, log_paths, plain, with_logs
+from copem_replay.experiment.file import Source, address, entries_of, load, log_paths, plain, with_logs
 from copem_replay.experiment.schema import Experiment, output_unit
-from copem_replay.experiment.validate import across_logs, against_log, bound, log_names, problems, read_logs
+from copem_replay.experiment.validate import across_logs, bound, log_names, problems, read_logs
 from copem_replay.io.recording import Recording
+from copem_replay.io.together import File, first_of
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
     from copem_replay.pipeline.log_survey import LogSurvey
@@ -34,7 +37,7 @@ class Study:
     source: Source
     experiment: Experiment
     recordings: tuple[Recording, ...]
-    skipped: tuple[tuple[Path, str], ...] = ()
+    skipped: tuple[tuple[File, str], ...] = ()
     survey: LogSurvey | None = None
 
 
@@ -85,7 +88,7 @@ def study_of(
     if recordings is None:
         return read_study(source, given, survey=survey)
     listed = [recordings] if isinstance(recordings, Recording | str | PathLike) else list(recordings)
-    paths = tuple(str(Path(one.path if isinstance(one, Recording) else one)) for one in listed)
+    paths = tuple(one if isinstance(one, str) and is_url(one) else str(Path(_path_of(one))) for one in listed)
     if not paths:
         raise InputError("recordings: expected at least one, found none")
     source = with_logs(source, paths, "recordings")
@@ -95,6 +98,10 @@ def study_of(
     if len(read) < len(listed):
         raise InputError("recordings: expected either recordings or paths, found both")
     return _study_with(source, given, read)
+
+
+def _path_of(one: Recording | AnyPath) -> AnyPath:
+    return address(first_of(one.place)) if isinstance(one, Recording) else one
 
 
 def read_study(
@@ -131,7 +138,7 @@ def _study_with(source: Source, given: Experiment | None, recordings: Sequence[R
     found += across_logs(experiment, recordings, source)
     names = [recording.scene.log for recording in recordings]
     if len(set(names)) < len(names):
-        names = log_names([recording.path for recording in recordings])
+        names = log_names([first_of(recording.place) for recording in recordings])
         found += [f"recordings: expected each once, found {n} twice" for n in {*names} if names.count(n) > 1]
     if found:
         raise InputError(found)

@@ -29,7 +29,7 @@ from copem_replay.io.recording import Recording, choose_topic, foreign, is_truth
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list
-from copem_replay.io.together import Place, first_of
+from copem_replay.io.together import Local, first_of
 
 if TYPE_CHECKING:  # it imports much that a recording of the truth alone does not need
     from copem_replay.io.recorded_osi import RecordedLists
@@ -41,7 +41,7 @@ _OURS = "copem/"  # what this project wrote beside a recording
 _EGO_HINT = "give `ego: <id>` in the experiment, or `--ego <id>`"
 
 
-def survey(place: Place | str) -> Survey:
+def survey(place: Local | str) -> Survey:
     """Look at a recording: the same findings for the same bytes. A bad recording raises nothing."""
     place = Path(place) if isinstance(place, str) else place
     path = first_of(place)
@@ -99,14 +99,14 @@ def _units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
         from copem_replay.io.recorded_lists import lists_on  # it takes time, and most recordings have no lists
 
         try:
-            found = lists_on(recording.place, topic, recording.scene, recording.around)
+            found = lists_on(recording.local, topic, recording.scene, recording.around)
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
             continue
         yield _unit(topic, found, _against_truth(recording, found) if len(found.tracks.stamp_ns) else {})
 
 
-def _units_alone(log: Log, place: Place, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
+def _units_alone(log: Log, place: Local, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
     """The lists of each unit of a recording without truth, as far as they can be read without one."""
     from copem_replay.experiment.draft.clocks import without_objects
     from copem_replay.io.recorded_lists import lists_on

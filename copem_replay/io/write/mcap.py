@@ -27,7 +27,7 @@ from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Scene, Tracks
-from copem_replay.io.together import Place
+from copem_replay.io.together import Local
 from copem_replay.io.window import Window
 from copem_replay.io.write import detail_json as detail
 from copem_replay.io.write.drawing import TruthScene
@@ -59,7 +59,7 @@ ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 
 def write_mcap(
     path: Path,
-    source: Place,
+    source: Local,
     scene: Scene,
     run_tracks: Iterable[Mapping[str, FusedTracks]],
     table: pd.DataFrame,

@@ -21,7 +21,7 @@ from copem_replay.io.containers.osi_trace import Trace, message_class
 from copem_replay.io.containers.rosbag2 import Bag
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
-from copem_replay.io.together import AHEAD, PART, Place
+from copem_replay.io.together import AHEAD, PART, Local
 from copem_replay.io.window import Window
 from copem_replay.io.write.message_family import OSI_CHANNEL, osi_version
 from copem_replay.io.write.pass_through import Catalogue, Original
@@ -42,7 +42,7 @@ class Source(Protocol):
         """The messages in order of log time, with the channel numbers of the output."""
 
 
-def source_of(path: Place, window: Window | None = None) -> Source:
+def source_of(path: Local, window: Window | None = None) -> Source:
     """What can be copied of a recording, or of a window of it. Raises RecordingError where nothing can be read."""
     return _source(open_log(path).within(window))
 
