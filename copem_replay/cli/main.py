@@ -94,8 +94,8 @@ def _ended() -> int:
     except CopemError as error:
         complain(error.problems)
         return 2
-    except (KeyboardInterrupt, typer.Abort):
-        complain(["interrupted"])
+    except (KeyboardInterrupt, typer.Abort) as error:
+        complain([str(error) or "interrupted"])
         return 130
     except BrokenPipeError:  # the reader of our output has gone: `copem-replay info … | head`
         _discard_output()

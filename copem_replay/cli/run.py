@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shlex
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from copem_replay.cli.cluster import crew_at, hint
 from copem_replay.cli.inspect import source_with
 from copem_replay.cli.options import Ego, ExperimentFile, FromS, Logs, ToS
 from copem_replay.cli.progress import with_progress
@@ -39,23 +41,42 @@ def run(
         str | None,
         typer.Option(metavar="FOLDER", help="Where finished pieces are kept, and found again: a folder or a URL."),
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHERE",
+            help="Processes in place of threads, by Dask: local, local:N, tcp://HOST:PORT, tls://… or scheduler.json.",
+        ),
+    ] = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,
     live: Annotated[bool, typer.Option("--live", help="Also show the replay in a running Rerun viewer.")] = False,
     viewer: Annotated[str | None, typer.Option(metavar="URL", help="Address of that viewer [on this machine].")] = None,
 ) -> int:
     """Replay an experiment, write its results, print the summary."""
-    from copem_replay.cli.api.run import pieces_in
-    from copem_replay.cli.api.study import prepared, read_study
+    from copem_replay.cli.api.run import pieces_in, with_crew, workers
+    from copem_replay.cli.api.study import Study, prepared, read_study
     from copem_replay.pipeline.log_survey import LogSurvey
     from copem_replay.results.place import check_inputs, taken
 
     source = source_with(experiment, {"ego": ego, "runs": runs, "seed": seed}, log or (), (from_s, to_s))
-    with taken(out or Path("out") / experiment.stem, overwrite=overwrite) as place:
+    out = out or Path("out") / experiment.stem
+    if cluster is not None:
+        from copem_replay.pipeline.crew.dask_workers import check_address
+
+        check_address(cluster)
+        pieces = pieces or f"{out}.pieces"
+    with taken(out, overwrite=overwrite) as place:
         note(place.notes)
         place.notes.clear()
         kept = None if pieces is None else pieces_in(pieces)
-        study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(kept))
-        check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
+        with crew_at(cluster, kept) as crew:
+
+            def read() -> Study:
+                study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(kept), crew=crew)
+                check_inputs(place, [experiment, *(path for recording in study.recordings for path in recording.paths)])
+                return study
+
+            study = read() if crew is None else with_crew(read, crew)
         url = _viewer(study.experiment, viewer) if live or viewer is not None else None
         from copem_replay.cli.api.run import fill, replayed
         from copem_replay.metrics.summary_text import summary_text
@@ -63,13 +84,17 @@ def run(
 
         ready, warnings = prepared(study)
         note(warnings)
+        began_s = time.perf_counter()
         result = with_progress("replaying", lambda progress: replayed(study, ready, jobs, progress, kept))
+        costs = list(result.replayed.costs)
+        if cluster is None:
+            costs += hint(time.perf_counter() - began_s, workers(jobs))
         notes = fill(place, result, skipped=study.skipped, viewer=url)
         if kept is not None:
             note(kept.damaged)
             complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.store.where}"])
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
-        note([*place.notes, *skipped, *notes, *result.replayed.costs])
+        note([*place.notes, *skipped, *notes, *costs])
         print(summary_text(result.summary, width_of(sys.stdout)))
         if result.sweep is not None:
             say(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")

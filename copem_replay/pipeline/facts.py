@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from copem_replay.core.time_chunk import WHOLE
 from copem_replay.core.tracks import Scene
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
@@ -21,13 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Facts:
-    """Of one log in one experiment. `episodes`: rows of a run and configuration. `times`: as `list_times` has them."""
+    """Of one log in one experiment. `episodes`: rows of a run and configuration. `times`: as `list_times` has them.
+
+    `listable`: states that a run draws for, by which the time it takes is estimated.
+    """
 
     episodes: int
     same_instants: bool
     oddities: tuple[str, ...]
     times: dict[str, ListTimes]
     outputs: dict[str, OutputTimes]
+    listable: int
 
     @classmethod
     def of(cls, recording: Recording, replay: Replay, experiment: Experiment) -> Self:
@@ -38,6 +43,7 @@ class Facts:
             tuple(oddities(replay, experiment, replay.ever_met)),
             list_times(replay, experiment),
             output_times([recording], experiment),
+            len((replay.found(WHOLE) if replay.chunks == (WHOLE,) else replay.measured).tracks.frame_ix),
         )
 
     @classmethod
@@ -49,6 +55,7 @@ class Facts:
             tuple(said["oddities"]),
             {name: ListTimes.read(times) for name, times in said["times"].items()},
             {name: OutputTimes(**sums) for name, sums in said["outputs"].items()},
+            said["listable"],
         )
 
     def as_json(self) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from copem_replay.io.together import File
+    from copem_replay.pipeline.crew.crew import Crew
     from copem_replay.pipeline.pieces import Pieces
     from copem_replay.pipeline.prepare import Replay
     from copem_replay.results.place import Place
@@ -135,13 +137,16 @@ def run(
     jobs: int | None = None,
     progress: Progress | None = None,
     pieces: AnyPath | None = None,
+    crew: Executor | None = None,
 ) -> StudyResult:
     """Replay recordings through an experiment, and measure.
 
     `experiment`: an Experiment, its keys and values in a dict, or the path of its file. `recordings`: Recordings or
     paths, one or several; None: those the experiment names. `jobs`: workers; None: one per core. The result does not
     depend on it. `progress(done, total)` is called after each block of runs. `pieces`: a folder or a URL where what
-    was computed is kept, and found by the next run (docs/guide/scale.md).
+    was computed is kept, and found by the next run (docs/guide/scale.md). `crew`: an executor of processes on this
+    machine or on others, such as ProcessPoolExecutor or `Client.get_executor()` of Dask, in place of `jobs`; it needs
+    `pieces` that all of them see, and recordings by their paths.
 
     Raises InputError, before any run, with all problems at once: of the experiment (ExperimentError), of recordings, of
     both together, times without a closed form, runs that no memory holds.
@@ -153,8 +158,24 @@ def run(
     from copem_replay.pipeline.log_survey import LogSurvey
 
     kept = None if pieces is None else pieces_in(str(pieces))
-    study = study_of(experiment, recordings, LogSurvey(kept))
+    if crew is None:
+        study = study_of(experiment, recordings, LogSurvey(kept))
+    elif kept is None:
+        raise InputError("crew: expected `pieces`, too: a folder or a URL that all its workers see")
+    else:
+        from copem_replay.pipeline.crew.crew import Crew
+
+        told = None if progress is None else lambda p: progress(p.rows_done, p.rows)
+        hands = Crew(crew, kept, told)
+        study = with_crew(lambda: study_of(experiment, recordings, LogSurvey(kept), hands), hands)
     return replayed(study, prepared(study)[0], jobs, progress, kept)
+
+
+def with_crew(read: Callable[[], Study], crew: Crew) -> Study:
+    """A study as it is `read`, once its pieces are there; read again where workers died of one of its logs."""
+    while crew.fill((study := read()).experiment, study.recordings):
+        pass
+    return study
 
 
 def pieces_in(address: str) -> Pieces:

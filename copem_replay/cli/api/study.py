@@ -13,13 +13,14 @@ from copem_replay.core.remote import is_url
 from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.cross_references import NO_EGO, references
 from copem_replay.experiment.drive import of_log
-from copem_replay.experiment.file import Source, address, entries_of, load, log_paths, plain, with_logs
+from copem_replay.experiment.file import Source, address, entries_of, identity, load, log_paths, plain, with_logs
 from copem_replay.experiment.schema import Experiment, output_unit
-from copem_replay.experiment.validate import across_logs, bound, log_names, problems, read_logs
+from copem_replay.experiment.validate import Refused, across_logs, bound, log_names, problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.io.together import File, first_of
+from copem_replay.io.together import File, files_of, first_of
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
+    from copem_replay.pipeline.crew.crew import Crew
     from copem_replay.pipeline.log_survey import LogSurvey
     from copem_replay.pipeline.prepare import Replay
 
@@ -78,7 +79,10 @@ def _examined(source: Source, given: Experiment | None) -> tuple[Experiment | No
 
 
 def study_of(
-    experiment: AnyExperiment, recordings: AnyRecordings | None = None, survey: LogSurvey | None = None
+    experiment: AnyExperiment,
+    recordings: AnyRecordings | None = None,
+    survey: LogSurvey | None = None,
+    crew: Crew | None = None,
 ) -> Study:
     """An experiment with its recordings: those it names (None), those at some paths, or those that are read already.
 
@@ -86,7 +90,7 @@ def study_of(
     """
     source, given = source_of(experiment)
     if recordings is None:
-        return read_study(source, given, survey=survey)
+        return read_study(source, given, survey=survey, crew=crew)
     listed = [recordings] if isinstance(recordings, Recording | str | PathLike) else list(recordings)
     paths = tuple(one if isinstance(one, str) and is_url(one) else str(Path(_path_of(one))) for one in listed)
     if not paths:
@@ -94,7 +98,9 @@ def study_of(
     source = with_logs(source, paths, "recordings")
     read = [one for one in listed if isinstance(one, Recording)]
     if not read:
-        return read_study(source, given, survey=survey)
+        return read_study(source, given, survey=survey, crew=crew)
+    if crew is not None:
+        raise InputError("crew: expected paths of recordings, for its workers read them; found recordings")
     if len(read) < len(listed):
         raise InputError("recordings: expected either recordings or paths, found both")
     return _study_with(source, given, read)
@@ -105,16 +111,29 @@ def _path_of(one: Recording | AnyPath) -> AnyPath:
 
 
 def read_study(
-    source: Source, given: Experiment | None = None, *, skip_unreadable: bool = False, survey: LogSurvey | None = None
+    source: Source,
+    given: Experiment | None = None,
+    *,
+    skip_unreadable: bool = False,
+    survey: LogSurvey | None = None,
+    crew: Crew | None = None,
 ) -> Study:
-    """Read the recordings of an experiment, but those that are known to the survey, which says what stays in memory.
+    """Read the recordings of an experiment, but those that are known to the survey, and those that a crew can read.
+    The survey says what stays in memory.
 
     Raises InputError with every problem of it and of them.
     """
     experiment, found = _examined(source, given)
     if experiment is None:
         raise ExperimentError(found)
-    recordings, refused = read_logs(experiment, log_paths(source)[0], source, survey)
+    places, away = log_paths(source)[0], dict[str, list[Refused]]()
+    if crew is not None and not found:
+        away = crew.survey(experiment, places, source, skip_unreadable=skip_unreadable)
+    here = {place: key for place, key in places.items() if identity(place) not in away}
+    recordings, refused = read_logs(experiment, here, source, survey)
+    if away:  # in the order of the experiment
+        at = {path: k for k, place in enumerate(places) for path in files_of(place)}
+        refused = sorted([*refused, *(log for logs in away.values() for log in logs)], key=lambda log: at[log.path])
     if not recordings and not refused and not found:
         found.append(source.at(("logs",), "expected at least one recording, found none"))
     if not skip_unreadable or not recordings:

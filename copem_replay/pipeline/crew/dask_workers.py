@@ -1,0 +1,216 @@
+"""Workers of Dask: on this machine, or behind a scheduler that is there already. Nothing is deployed.
+
+Dask unpickles what it is sent, on both sides: a scheduler is trusted as one's own shell is.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import re
+import secrets
+import time
+import warnings
+from collections import Counter
+from concurrent.futures import CancelledError, Future, InvalidStateError
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from copem_replay.core.errors import CopemError, InputError
+from copem_replay.core.remote import is_url
+from copem_replay.pipeline.crew.crew import WorkerDiedError, Workers
+from copem_replay.pipeline.crew.task import Receipt, Task
+from copem_replay.pipeline.crew.worker import differs, done
+from copem_replay.pipeline.pieces import Pieces
+from copem_replay.pipeline.recipe import fingerprint
+from copem_replay.pipeline.store import store_at
+
+MOST_DEATHS = 3
+"""So many workers may die while they have a task, before it is what they die of (chosen)."""
+WAIT_S = 600.0
+"""So long a scheduler that has gone, or has no worker, is waited for (chosen: a machine is up again by then)."""
+_ANSWERS_S = 10.0
+_LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
+_PROBE = "probe.txt"
+
+
+def check_address(address: str) -> None:
+    """Raises InputError where an address is none, or Dask is not installed."""
+    if (
+        not _LOCAL.fullmatch(address)
+        and not address.startswith(("tcp://", "tls://"))
+        and Path(address).suffix != ".json"
+    ):
+        expected = "local, local:N, tcp://HOST:PORT, tls://HOST:PORT or a scheduler file (.json)"
+        raise InputError(f"--cluster: expected {expected}, found {address!r}")
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("--cluster: Dask is not installed: pip install 'copem-replay[cluster]'") from None
+
+
+class DaskWorkers(Workers):
+    """The workers of a scheduler; `cores`: how many there are of `local`. `wait_s`: as WAIT_S says.
+
+    Raises CopemError: no scheduler there, workers unlike this process, or that do not see the pieces.
+    """
+
+    def __init__(self, address: str, pieces: Pieces, cores: int, wait_s: float = WAIT_S) -> None:
+        self.address, self._pieces, self._wait_s = address, pieces, wait_s
+        self._given: dict[str, tuple[Future[Receipt], int]] = {}  # and how many pieces, by the keys of Dask
+        self._unwanted: list[Any] = []
+        self._deaths, self._beside = Counter[str](), set[str]()  # … while others of ours were there
+        self._patience, self._threads, self._changed = MOST_DEATHS, 1, True
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # what matters is said in our own words
+        self._cluster = _local(int(address.partition(":")[2] or cores)) if _LOCAL.fullmatch(address) else None
+        try:
+            self._client = self._connected(min(self._wait_s, _ANSWERS_S))
+        except (OSError, ValueError, TypeError) as error:  # nobody there; no address; tls:// without certificates
+            raise CopemError(f"--cluster: {address}: no scheduler answers there ({_in_a_line(error)})") from None
+        try:
+            self._begin(time.monotonic() + self._wait_s)
+        except TimeoutError:
+            self.close()
+            raise CopemError(f"--cluster: {address}: there is no worker, after {self._wait_s:.0f} s") from None
+        except BaseException:
+            self.close()
+            raise
+
+    def threads(self) -> int:
+        """How many tasks it does at once."""
+        while self._unwanted:
+            self._unwanted.pop().cancel()
+        if self._changed:
+            self._changed = False
+            with suppress(OSError):  # gone: futures say so
+                self._threads = max(sum(self._client.nthreads().values()), 1)
+        return self._threads
+
+    def give(self, task: Task, *, alone: bool) -> Future[Receipt]:
+        """Submit a task. `alone`: nothing else is, so that the first death is its own doing."""
+        self._patience = 1 if alone else MOST_DEATHS
+        mine: Future[Receipt] = Future()
+        key = f"copem-{secrets.token_hex(8)}"
+        self._given[key] = mine, len(task.keys)
+        given = self._client.submit(done, task, key=key, pure=False)
+        mine.add_done_callback(lambda _: self._let_go(key, given))
+        given.add_done_callback(lambda _: _landed(given, mine))
+        return mine
+
+    def come_back(self) -> None:
+        """Wait for the scheduler and a worker. Raises TimeoutError; CopemError as at the beginning."""
+        until_s = time.monotonic() + self._wait_s
+        while time.monotonic() < until_s:
+            with suppress(OSError):  # which a TimeoutError is
+                self._client.close(timeout=1)
+                self._client = self._connected(until_s - time.monotonic())
+                self._begin(until_s)
+                return
+        raise TimeoutError(f"{self.address}: the scheduler has not answered for {self._wait_s:.0f} s")
+
+    def close(self) -> None:
+        """Cancel what has not begun, and end what was begun here."""
+        with suppress(OSError):
+            self.threads()
+            self._client.close(timeout=1)
+        if self._cluster is not None:
+            self._cluster.close(timeout=10)
+
+    def _connected(self, timeout_s: float) -> Any:
+        """Raises OSError: nobody answers."""
+        import distributed
+
+        where: dict[str, Any] = {"address": self._cluster or self.address}
+        if Path(self.address).suffix == ".json":
+            where = {"scheduler_file": self.address}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of versions, which are compared more closely
+            return distributed.Client(**where, timeout=timeout_s, set_as_default=False)
+
+    def _begin(self, until_s: float) -> None:
+        """Wait for a worker, and look at all there are. Raises TimeoutError, CopemError."""
+        self._client.wait_for_workers(1, timeout=max(until_s - time.monotonic(), 1))
+        self._client.subscribe_topic("all", self._event)
+        self._changed = True
+        token = secrets.token_hex(8)
+        self._pieces.store.write(_PROBE, token.encode())
+        folder = str(Path.cwd())
+        found = self._client.run(greeting, fingerprint(), self._pieces.address, folder, token, on_error="return")
+        there = {worker: said for worker, said in found.items() if not isinstance(said, OSError)}  # others have died
+        unlike = [words for worker, said in there.items() if (words := _unlike(worker, said))]
+        if unlike:
+            many = f"({len(unlike)} of {len(there)} workers differ): results would not be the same bits"
+            raise CopemError(f"{self.address}: worker {unlike[0]} {many}")
+        for host, _, sees in there.values():
+            if not sees:
+                out = "--pieces with a shared folder or s3://…"
+                raise CopemError(f"{self._pieces.store.where}: not visible from worker {host}; {out}")
+
+    def _event(self, event: tuple[float, dict[str, Any]]) -> None:
+        """What the scheduler tells of workers; called where the client listens."""
+        _, said = event
+        self._changed |= said.get("action") in ("add-worker", "remove-worker")
+        if said.get("action") != "remove-worker" or said.get("expected"):
+            return
+        keys = [key for key in said["processing-tasks"] if key in self._given]
+        self.lost += 1
+        for key in keys:
+            mine, pieces = self._given[key]
+            self.again += pieces
+            self._deaths[key] += 1
+            self._beside |= {key} if len(keys) > 1 else set()
+            if self._deaths[key] >= self._patience:
+                host, alone = said["worker"].partition("://")[2], key not in self._beside
+                with suppress(InvalidStateError):
+                    mine.set_exception(WorkerDiedError(self._deaths[key], host, alone=alone))
+
+    def _let_go(self, key: str, given: Any) -> None:
+        """A task that is done, or not wanted any more. In whatever thread: Dask is told later."""
+        del self._given[key]
+        self._unwanted.append(given)
+
+
+def _landed(given: Any, mine: Future[Receipt]) -> None:
+    """Hand over what became of a task."""
+    with suppress(InvalidStateError):  # it is not wanted any more
+        try:
+            mine.set_result(given.result())
+        except (CancelledError, OSError):  # the scheduler is gone
+            mine.cancel()
+            mine.set_running_or_notify_cancel()
+        except Exception as error:
+            mine.set_exception(error)
+
+
+def greeting(expected: dict[str, str], pieces: str, folder: str, token: str) -> tuple[str, str | None, bool]:
+    """Of a worker: its host, in what it differs, whether it sees in the pieces what was written there."""
+    host, other = platform.node(), differs(expected)
+    try:
+        os.chdir(folder)
+        sees = is_url(pieces) or Path(pieces).is_dir()  # not to be made there
+        return host, other, sees and store_at(pieces).read(_PROBE) == token.encode()
+    except (OSError, CopemError):
+        return host, other, False
+
+
+def _unlike(worker: str, said: tuple[str, str | None, bool] | Exception) -> str:
+    """In what a worker differs, in words; empty: in nothing."""
+    if isinstance(said, Exception):  # it has not even the same modules
+        return f"{worker} has no such copem-replay as here ({_in_a_line(said)})"
+    return f"{said[0]} {said[1]}" if said[1] else ""
+
+
+def _local(count: int) -> Any:
+    """Workers on this machine, a process each, that nobody else is told of."""
+    import distributed
+
+    return distributed.LocalCluster(
+        n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+        memory_limit=None, silence_logs=logging.CRITICAL + 1, scheduler_kwargs={"allowed_failures": 1000},
+    )  # fmt: skip
+
+
+def _in_a_line(error: Exception) -> str:
+    return " ".join(f"{error}".split())[:200] or type(error).__name__

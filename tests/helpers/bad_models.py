@@ -1,0 +1,49 @@
+"""Detection models that do something to their process where an object is 45 m away."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import numpy as np
+
+import copem_replay as cr
+
+
+class _At45(cr.DetectionModel):
+    spare: int = 0  # a process to which nothing is done
+
+    def probability(self, view):  # type: ignore[no-untyped-def]
+        if os.getpid() != self.spare and (np.abs(view.range_m - 45) < 1e-6).any():
+            self.happen()
+        return 0.5 * np.ones(len(view.range_m))
+
+    def happen(self) -> None:
+        raise NotImplementedError
+
+
+class Deadly(_At45):
+    """Kills its process."""
+
+    def happen(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Failing(_At45):
+    """Raises, which is a defect of the model."""
+
+    def happen(self) -> None:
+        raise LookupError("this model fails")
+
+
+class Halting(_At45):
+    """Says so in a FIFO, and goes on when something is in another."""
+
+    said: str
+    go_on: str
+
+    def happen(self) -> None:
+        with open(self.said, "wb") as file:
+            file.write(b".")
+        with open(self.go_on, "rb") as file:
+            file.read()
