@@ -21,6 +21,7 @@ from copem_replay.io.together import File, Place, first_of
 from copem_replay.metrics.config import Measure
 from copem_replay.metrics.fixed import Fixed, fixed_in
 from copem_replay.results.belongings import MARK, check_still
+from copem_replay.results.by_log import LogRows, log_rows
 from copem_replay.results.tables import (
     AGAIN,
     BRAKING,
@@ -32,8 +33,6 @@ from copem_replay.results.tables import (
     ROWS,
     VERDICTS,
     file_of,
-    is_rowless,
-    read_arrow,
     read_csv,
     read_frame,
 )
@@ -159,15 +158,24 @@ class Results:
         return tuple(map(str, notes)) if isinstance(notes, list) else ()
 
     @cached_property
-    def arrow(self) -> dict[str, pa.Table]:
+    def by_log(self) -> dict[str, LogRows]:
         """The tables that comparisons read, by file name, those that are there."""
         place = self.folder / "detections.parquet"
-        if is_rowless(place):
-            raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
         columns = DETECTIONS | (VERDICTS if self.provenance.braking is not None else {})
-        tables = {place.name: read_arrow(place, columns, self._files(place))}
+        tables = {place.name: log_rows(place, columns, self._files(place))}
+        found = tables[place.name].where
+        if not found:
+            raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
+        if unknown := set(found) - {log.name for log in self.provenance.logs}:
+            raise InputError(f"{place}: expected the logs of provenance.json, found {min(unknown)!r}")
         there = {name: kinds for name, kinds in OPTIONAL.items() if (self.folder / name).is_file()}
-        tables |= {name: read_arrow(self.folder / name, kinds) for name, kinds in there.items()}
+        tables |= {name: log_rows(self.folder / name, kinds) for name, kinds in there.items()}
+        check_still(self.folder, self.seen)
+        return tables
+
+    def rows_of(self, log: str, *names: str) -> dict[str, pa.Table]:
+        """A log's rows of some of these tables, by default of all."""
+        tables = {name: rows.of(log) for name, rows in self.by_log.items() if not names or name in names}
         check_still(self.folder, self.seen)
         return tables
 

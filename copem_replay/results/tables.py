@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -91,47 +91,16 @@ def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], columns: Sequ
     return table
 
 
-def is_rowless(path: Path) -> bool:
-    """Whether a table is sound and has no row. Its columns then have no types either."""
-    from pyarrow import parquet
-
-    if path.is_dir():
-        return False
-    try:
-        return bool(parquet.read_metadata(path).num_rows == 0)
-    except (OSError, ValueError):  # the reader of the table reports it
-        return False
+def check_kind(path: Path, name: str, kind: str, found: pa.DataType) -> None:
+    """Raise InputError where a column is of another kind."""
+    if not _is(kind, found):
+        raise InputError(f"{path}: column {name}: expected {kind}, found {found}; {AGAIN}")
 
 
-def read_arrow(path: Path, columns: Mapping[str, str], files: Sequence[Path] = ()) -> pa.Table:
-    """These columns of a table, text as `string`, and those that it may have. `files`: of one that is a folder.
-
-    Raises InputError where one is missing or of another kind.
-    """
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    try:
-        there = parquet.read_schema(files[0] if files else path).names
-        if missing := [name for name in columns if name not in there]:
-            raise InputError(f"{path}: expected the column {missing[0]}, found none; {AGAIN}")
-        columns = dict(columns) | {n: kind for n, kind in MAY_HAVE.get(path.name, {}).items() if n in there}
-        table = parquet.read_table(list(files) or path, columns=list(columns))
-    except (OSError, ValueError) as error:  # what Arrow raises derives from these
-        why = " ".join(str(error).split())
-        raise InputError(f"{path}: expected a table that can be read, found damage: {why}; {AGAIN}") from None
-    for k, (name, kind) in enumerate(columns.items()):
-        column = table[name]
-        if kind == "text" and pa.types.is_dictionary(column.type):
-            column = column.cast(column.type.value_type)
-        if not _is(kind, column.type):
-            raise InputError(f"{path}: column {name}: expected {kind}, found {column.type}; {AGAIN}")
-        if kind == "text":
-            if column.null_count:
-                raise InputError(f"{path}: column {name}: expected text in every row, found none in some; {AGAIN}")
-            column = column.cast(pa.string())
-        table = table.set_column(k, name, column)
-    return table
+def check_text(path: Path, name: str, column: pa.ChunkedArray) -> None:
+    """Raise InputError where a name is missing."""
+    if column.null_count:
+        raise InputError(f"{path}: column {name}: expected text in every row, found none in some; {AGAIN}")
 
 
 def _is(kind: str, what: pa.DataType) -> bool:

@@ -105,16 +105,18 @@ def test_fewer_runs_are_the_first_ones(folder: Path) -> None:
     """Instants of runs that are not compared are not read for others."""
     from copem_replay.results.compare.configuration_data import side_of
     from copem_replay.results.compare.labels import named
-    from copem_replay.results.compare.pairing import Grid, grid_of
+    from copem_replay.results.compare.pairing import grid_of
     from copem_replay.results.read import open_results
 
     results = open_results(folder)
-    whole = grid_of([results])
-    fewer = Grid(whole.logs, whole.objects, whole.log_ix, 2)
+    (log,) = results.provenance.logs
+    tables = results.rows_of(log.name)
+    whole = grid_of(0, [tables["detections.parquet"]], results.provenance.runs, 0)
+    fewer = replace(whole, runs=2)
     gnn = next(one for one in named([results]) if one.label == "gnn")
-    six, two = (side_of(gnn, grid).accuracy for grid in (whole, fewer))
+    six, two = (side_of(gnn, tables, grid).accuracy for grid in (whole, fewer))
     assert six is not None
     assert two is not None
-    assert (six.by_run, len(six.of_place), len(two.of_place)) == (True, 6, 2)
+    assert (six.by_run, len(six.of_run), len(two.of_run)) == (True, 6, 2)
     for place in range(2):
-        np.testing.assert_array_equal(six.available_s[six.of_place[place]], two.available_s[two.of_place[place]])
+        np.testing.assert_array_equal(six.available_s[six.of_run[place]], two.available_s[two.of_run[place]])

@@ -68,19 +68,19 @@ def test_counts_of_other_clusters_are_refused():
     with pytest.raises(ValueError, match="2 clusters"):
         resampled_sums(np.ones((2, 1)), count)
     with pytest.raises(ValueError, match="4 clusters"):
-        resampled_medians(np.ones(2), np.array([0, 3]), count)
+        resampled_medians(np.ones(2), np.array([0, 3]), count, np.ones(2, dtype=np.int64))
 
 
 numbers = st.integers(-3, 3).map(float) | st.sampled_from([-math.inf, math.inf])
-rows = st.lists(st.tuples(numbers, st.integers(0, 3)), max_size=12)
+rows = st.lists(st.tuples(numbers, st.integers(0, 3), st.integers(1, 3)), max_size=12)
 
 
 @given(rows, st.lists(st.lists(st.integers(0, 3), min_size=4, max_size=4), min_size=1, max_size=5))
 def test_medians_of_resamples_are_those_of_the_rows_written_out(items, count):
-    values, cluster = (np.array([item[k] for item in items], dtype=kind) for k, kind in ((0, float), (1, np.int64)))
-    found = resampled_medians(values, cluster, np.array(count, dtype=np.uint32))
+    values, cluster, n = (np.array([item[k] for item in items], dtype=(float, int, int)[k]) for k in range(3))
+    found = resampled_medians(values, cluster, np.array(count, dtype=np.uint32), n)
     for median, multiplicity in zip(found, count, strict=True):
-        written_out = np.repeat(values, [multiplicity[c] for c in cluster])
+        written_out = np.repeat(values, [multiplicity[c] * times for c, times in zip(cluster, n, strict=True)])
         if not len(written_out):
             assert math.isnan(median)
         else:
@@ -94,7 +94,7 @@ def test_medians_are_those_of_statistics_with_weights():
     expected = [
         quantile_with_never(values, np.ones(1000, dtype=bool), 0.5, row[cluster].astype(float)) for row in count
     ]
-    assert resampled_medians(values, cluster, count).tolist() == expected
+    assert resampled_medians(values, cluster, count, np.ones(1000, dtype=np.int64)).tolist() == expected
 
 
 def limits(values, clusters, confidence=0.95):

@@ -32,7 +32,7 @@ def test_an_opened_folder_tells_its_provenance(folder: Path) -> None:
 
 def test_files_are_read_when_they_are_asked_for(folder: Path) -> None:
     found = open_results(folder)
-    assert found.arrow["detections.parquet"]["detection_s"].to_pylist() == [1.0, 2.0]
+    assert found.rows_of("a")["detections.parquet"]["detection_s"].to_pylist() == [1.0, 2.0]
     assert found.source.data == {"version": 1, "ego": None}
     with pytest.raises(InputError, match=r"experiment\.yaml:1: logs: missing"):
         _ = found.table
@@ -47,5 +47,5 @@ def test_tables_of_other_results_are_refused(folder: Path, tmp_path: Path) -> No
     shutil.rmtree(folder)
     (tmp_path / "other").rename(folder)
     with pytest.raises(InputError, match="other results took its place while it was read; do it once more"):
-        _ = found.arrow
+        _ = found.rows_of("a")
     assert found.source.data["version"] == 1, "what was read before"

@@ -7,30 +7,66 @@ runs do not tell about other traffic, and few of anything do not tell how it var
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
 
-from copem_replay.core.tracks import Bool, Int
+from copem_replay.core.tracks import Int
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS, Resamples, resamples
-from copem_replay.results.compare.pairing import Grid
 
 _KEPT = 4
 """Sets of clusters whose draws are kept (chosen: few differ, and each may be large)."""
 
 
+_SUMMED = ("n", "only", "sums")
+"""Columns of items that are summed when they become one; the others are then alike."""
+
+
 @dataclass(frozen=True)
-class Whose:
-    """What items (i,) are of: a log, an object (−1: of none in particular), a run (−1: of all)."""
+class Items:
+    """What a figure is made of, by columns (i, …): `logs`, `objects` (−1: of none in particular), `runs` (−1: of all).
 
-    log_ix: Int
-    object_ix: Int
-    run: Int
+    These are numbers of what there are `Names` of. `n`: how many pairs (rows, lists) an item stands for.
+    """
 
-    def take(self, kept: Bool) -> Whose:
-        """Some of them."""
-        return Whose(self.log_ix[kept], self.object_ix[kept], self.run[kept])
+    columns: Mapping[str, NDArray[Any]]
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.columns[name]
+
+    def condensed(self, *, runs: bool) -> Items:
+        """Fewer items that say the same: equal ones are one. `runs`: those of several stay apart."""
+        columns = {**self.columns, "runs": self["runs"] if runs else np.full_like(self["runs"], -1)}
+        group = np.zeros(len(self["n"]), dtype=np.int64)
+        for name in columns.keys() - {*_SUMMED}:
+            number, known = pd.factorize(columns[name])
+            group = pd.factorize(group * max(len(known), 1) + number)[0]
+        first = np.unique(group, return_index=True)[1]  # groups are numbered by their first items
+        return Items({name: _summed(of, group) if name in _SUMMED else of[first] for name, of in columns.items()})
+
+    @staticmethod
+    def joined(parts: Sequence[Items]) -> Items:
+        """Items of several logs."""
+        return Items({name: np.concatenate([part[name] for part in parts]) for name in parts[0].columns})
+
+
+def _summed(values: NDArray[Any], group: Int) -> NDArray[Any]:
+    """(g, …) sums of values (i, …) of each group."""
+    sums = [np.bincount(group, column) for column in np.atleast_2d(values.T)]
+    return np.stack(sums, axis=-1).reshape(len(sums[0]), *values.shape[1:]).astype(values.dtype)
+
+
+@dataclass(frozen=True)
+class Names:
+    """What the numbers of items are of."""
+
+    logs: Sequence[str]
+    objects: list[str]  # log and id, apart by a line feed
+    runs: int
 
 
 class Draws:
@@ -51,35 +87,34 @@ class Draws:
 
 @dataclass(frozen=True)
 class Clusters:
-    """`names` of K clusters, sorted, and which one each item is of (i,), −1: of none, it always counts once."""
+    """`names` of K clusters, sorted, and the number of each log, object or run among them (−1: none, counts once)."""
 
     over: str
     names: tuple[str, ...]
-    of: Int
+    number: Int  # the last: of −1
+
+    def of(self, items: Items) -> Int:
+        """(i,) the cluster of each item, −1: of none."""
+        found: Int = self.number[items[self.over]]
+        return found
 
 
-def resampled_over(rows: Whose) -> str:
-    """What is resampled of a pair, going by all rows that both have: the same for all its metrics."""
-    things, logs = np.unique(rows.object_ix), np.unique(rows.log_ix)
-    if len(things) == 1 and len(logs) == 1:
+def resampled_over(objects: Sequence[int]) -> str:
+    """What is resampled of a pair, alike for all its metrics. `objects`: of how many each log has rows."""
+    if sum(objects) == 1:
         return "runs"
-    return "logs" if len(logs) >= FEWEST_CLUSTERS else "objects"
+    return "logs" if sum(count > 0 for count in objects) >= FEWEST_CLUSTERS else "objects"
 
 
-def clusters(whose: Whose, over: str, grid: Grid) -> Clusters | None:
-    """The logs, objects or runs of items that are resampled; None: too few of them have the figure."""
-    if over == "runs":
-        found = _named(over, whose.run, [str(run) for run in range(grid.runs)])
-    elif over == "logs":
-        found = _named(over, whose.log_ix, grid.logs)
-    else:
-        found = _named(over, whose.object_ix, grid.objects)
-    return found if len(found.names) >= FEWEST_CLUSTERS else None
+def clusters(items: Items, over: str, names: Names) -> Clusters | None:
+    """The logs, objects or runs that are resampled; None: too few of them have the figure.
 
-
-def _named(over: str, of: Int, names: Sequence[str]) -> Clusters:
-    """Clusters in the order of their names, as `summary.csv` has them."""
-    there = sorted({int(k) for k in np.unique(of[of >= 0])}, key=lambda k: names[k])
-    number = np.full(len(names) + 1, -1, dtype=np.int64)
+    In the order of their names, as `summary.csv` has them.
+    """
+    called = {"logs": names.logs, "objects": names.objects, "runs": [str(run) for run in range(names.runs)]}[over]
+    there = sorted(np.unique(items[over][items[over] >= 0]).tolist(), key=lambda k: called[k])
+    if len(there) < FEWEST_CLUSTERS:
+        return None
+    number = np.full(len(called) + 1, -1, dtype=np.int64)
     number[there] = np.arange(len(there))
-    return Clusters(over, tuple(names[k] for k in there), number[of])
+    return Clusters(over, tuple(called[k] for k in there), number)

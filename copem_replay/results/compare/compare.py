@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,15 +13,16 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import SAME_INSTANT_NS
-from copem_replay.results.compare.bootstrap import Draws, Whose
+from copem_replay.results.compare.all_logs import AllLogs
+from copem_replay.results.compare.bootstrap import Draws, Names, resampled_over
 from copem_replay.results.compare.comparable import check_comparable
-from copem_replay.results.compare.configuration_data import ConfigurationData, side_of
-from copem_replay.results.compare.equal_ghosts import notes_on_equal_ghosts, why_not
+from copem_replay.results.compare.configuration_data import ConfigurationData, rows_of, side_of
+from copem_replay.results.compare.equal_ghosts import ghost_totals, kept_by, notes_on_equal_ghosts, why_not
 from copem_replay.results.compare.ideals import notes_on_outputs
 from copem_replay.results.compare.inputs import read_folders
 from copem_replay.results.compare.labels import Named, chosen, named
 from copem_replay.results.compare.limits import limits
-from copem_replay.results.compare.metrics import Regret, Setting, own_rate, regrets
+from copem_replay.results.compare.metrics import Regret, Setting, regrets
 from copem_replay.results.compare.notes import (
     note_on_measuring,
     notes_on_folders,
@@ -30,7 +31,7 @@ from copem_replay.results.compare.notes import (
     notes_on_rows,
 )
 from copem_replay.results.compare.paired_statistics import mcnemar
-from copem_replay.results.compare.pairing import Grid, grid_of
+from copem_replay.results.compare.pairing import Grid, grid_of, number
 from copem_replay.results.compare.same_drive import check_names, notes_on_differences, renamed
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 
 ALL = "all"
 """What stands for the log in figures of all logs."""
-ALL_LOGS = -1
-"""And for its number."""
 COLUMNS = {
     "log": "object",
     "configuration": "object",
@@ -109,67 +108,76 @@ def compare(
     read = read_folders(folders)
     check_comparable(read)
     read, renames = renamed(read)
-    grid = grid_of(read)
     against, *others = chosen(named(read), configurations, baseline)
     check_names(against, others, renames)
     used = list(dict.fromkeys(one.results for one in (against, *others)))
-    second = side_of(against, grid)
-    setting = _setting(read, second, false_positives_per_min)
-    draws = Draws(read[0].provenance.seed)
-    rows: list[dict[str, object]] = []
-    sides: list[ConfigurationData] = []
-    reasons: dict[str, str | None] = {}
+    logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
+    totals = ghost_totals((against, *others), logs, runs)
+    asked = false_positives_per_min
+    if asked is None and against in totals:
+        false_positives_per_min = totals[against].per_min
+    reasons, settings = {}, {}
+    setting = Setting(_horizon_s(read, against, logs), float(read[0].provenance.measure["gospa"]["power"]))
     for one in others:
-        first = side_of(one, grid)
-        _check_same_episodes(one, first, against, second, grid)
-        sides.append(first)
-        cells = np.flatnonzero(first.there & second.there)
-        pair = Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
-        reasons[one.label] = why_not(
-            first, second, setting.false_positives_per_min, asked=false_positives_per_min is not None,
-            truth=against.configuration in against.results.truth,
-        )  # fmt: skip
-        mine = setting if reasons[one.label] is None else replace(setting, false_positives_per_min=None)
-        for regret in regrets(first, second, grid, mine, metrics):
-            names = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
-            fixed = _fixed(regret.metric, one, against)
-            rows += (row | names for row in _rows(regret, pair, grid, draws, fixed=fixed))
-    # All logs first, then log by log; configurations and metrics stay in their order.
-    rows = [row for log in (ALL_LOGS, *range(len(grid.logs))) for row in rows if row["log_ix"] == log]
-    table = pd.DataFrame(rows, columns=list(COLUMNS)).astype(COLUMNS)
+        both = totals.get(one), totals.get(against)
+        truth = against.configuration in against.results.truth
+        why = why_not(*both, false_positives_per_min, asked=asked is not None, truth=truth)
+        kept = None if why is not None else kept_by(*both, false_positives_per_min)
+        reasons[one.label], settings[one] = why, replace(setting, kept=kept)
+    names, draws = Names(logs, [], runs), Draws(read[0].provenance.seed)
+    pairs = {one: AllLogs() for one in others}
+    rows: list[dict[str, object]] = []
+    for k, log in enumerate(logs):
+        tables = {results: results.rows_of(log) for results in used}
+        grid = grid_of(k, (of["detections.parquet"] for of in tables.values()), runs, len(names.objects))
+        names.objects.extend(f"{log}\n{name}" for name in grid.objects)
+        second = side_of(against, tables[against.results], grid)
+        for one, pair in pairs.items():
+            first = side_of(one, tables[one.results], grid)
+            _check_same_episodes(one, first, against, second, log, grid)
+            found = list(regrets(first, second, grid, settings[one], metrics))
+            pair.add(first, second, found, grid, more=len(logs) > 1)
+            if len(logs) > 1:
+                over = resampled_over(pair.objects[-1:])
+                rows += [{"log": log, **_row(of, one, against, over, names, draws)} for of in found]
+    overall = [
+        {"log": ALL, **_row(of, one, against, resampled_over(pair.objects), names, draws)}
+        for one, pair in pairs.items()
+        for of in pair.regrets()
+    ]
+    table = pd.DataFrame([*overall, *rows], columns=list(COLUMNS)).astype(COLUMNS)
     return Comparison(
         table=table,
         baseline=against.label,
         configurations=tuple(one.label for one in others),
         horizon_s=setting.horizon_s,
-        false_positives_per_min=setting.false_positives_per_min,
+        false_positives_per_min=false_positives_per_min,
         notes=(
             *notes_on_folders(used),
             *notes_on_differences(used, renames),
-            *notes_on_pairs(against.label, second.there, {side.label: side.there for side in sides}),
+            *notes_on_pairs(against, pairs),
             *note_on_measuring(against, others),
             *notes_on_outputs(against, others),
-            *notes_on_instants(second, sides, grid.logs),
+            *notes_on_instants(against, pairs, logs),
             *notes_on_equal_ghosts(reasons),
-            *notes_on_rows(table, setting.false_positives_per_min),
+            *notes_on_rows(table, false_positives_per_min),
         ),
     )
 
 
-def _setting(folders: Sequence[Results], baseline: ConfigurationData, false_positives_per_min: float | None) -> Setting:
-    """What holds for all pairs; the longest episode is that of any folder."""
-    measure = folders[0].provenance.measure
-    horizon_s = measure["horizon_s"]
-    if horizon_s is None:
-        used_s = [one.provenance.horizon_used_s for one in folders if one.provenance.horizon_used_s is not None]
-        horizon_s = max(used_s) if used_s else float(np.nanmax(baseline.ended_s - baseline.onset_s))
-    if false_positives_per_min is None and baseline.ghosts is not None:
-        false_positives_per_min = own_rate(baseline.ghosts)
-    return Setting(float(horizon_s), float(measure["gospa"]["power"]), false_positives_per_min)
+def _horizon_s(folders: Sequence[Results], against: Named, logs: Sequence[str]) -> float:
+    """The longest episode is that of any folder."""
+    horizon_s = folders[0].provenance.measure["horizon_s"]
+    used_s = [one.provenance.horizon_used_s for one in folders if one.provenance.horizon_used_s is not None]
+    if horizon_s is None and not used_s:
+        for log in logs:
+            rows = rows_of(against, against.results.rows_of(log, "detections.parquet"))["detections.parquet"]
+            used_s += (number(rows["ended_s"]) - number(rows["onset_s"])).tolist()
+    return float(np.nanmax(used_s) if horizon_s is None else horizon_s)
 
 
 def _check_same_episodes(
-    one: Named, first: ConfigurationData, against: Named, second: ConfigurationData, grid: Grid
+    one: Named, first: ConfigurationData, against: Named, second: ConfigurationData, log: str, grid: Grid
 ) -> None:
     """Raise InputError where an object is not looked at from and until the same time: no pair then is one."""
     if one.results is against.results:
@@ -179,7 +187,7 @@ def _check_same_episodes(
         found, expected = getattr(first, what), getattr(second, what)
         other = np.flatnonzero(both & (np.abs(found - expected) > 1e-9 * SAME_INSTANT_NS))
         if len(other):
-            log, _, name = grid.objects[grid.object_of[other[0]]].partition("\n")
+            name = grid.objects[other[0] // grid.runs]
             raise InputError(
                 f"{one.results.folder}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
                 f"{against.results.folder}, found {found[other[0]]:g}: not the same ego, recording or units"
@@ -193,27 +201,18 @@ def _fixed(metric: str, *sides: Named) -> bool:
     return all(side.results.fixed.known(side.configuration) for side in sides)
 
 
-def _rows(regret: Regret, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool) -> Iterator[dict[str, object]]:
-    """A row of all logs, then, where there are several, one for each.
-
-    `pair`: all rows that both sides have. `fixed`: the metric is the same in every run.
-    """
-    yield _row(regret, pair, grid, draws, fixed=fixed) | {"log": ALL, "log_ix": ALL_LOGS}
-    for k, name in enumerate(grid.logs if len(grid.logs) > 1 else ()):
-        of_log = replace(regret, figure=regret.figure.take(regret.figure.whose.log_ix == k))
-        yield _row(of_log, pair.take(pair.log_ix == k), grid, draws, fixed=fixed) | {"log": name, "log_ix": k}
-
-
-def _row(regret: Regret, pair: Whose, grid: Grid, draws: Draws, *, fixed: bool) -> dict[str, object]:
+def _row(regret: Regret, one: Named, against: Named, over: str, names: Names, draws: Draws) -> dict[str, object]:
+    """Of a log, or of all. `over`: what is resampled."""
     figure = regret.figure
     value, other, difference = figure.values()
-    row: dict[str, object] = {"value": _number(value), "baseline_value": _number(other), "n": int(figure.n.sum())}
+    row: dict[str, object] = {"configuration": one.label, "baseline": against.label, "metric": regret.metric}
+    row |= {"value": _number(value), "baseline_value": _number(other), "n": int(figure.items["n"].sum())}
     row["difference"] = _number(difference)
-    row |= limits(figure, difference, pair, grid, draws, fixed=fixed)
-    if figure.only is not None:
-        only = figure.only.sum(axis=0)
+    row |= limits(figure, difference, over, names, draws, fixed=_fixed(regret.metric, one, against))
+    if "only" in figure.items.columns:
+        only = figure.items["only"].sum(axis=0)
         row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
-        row["p_value"] = mcnemar(int(only[0]), int(only[1])) if len(figure.only) else None
+        row["p_value"] = mcnemar(int(only[0]), int(only[1])) if len(figure.items["n"]) else None
     if regret.kept is not None:
         for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
             row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.false_positives_per_min

@@ -1,4 +1,4 @@
-"""One side of a pair: what a configuration gave, laid out on the grid."""
+"""One side of a pair: what a configuration gave in a log, laid out on the grid."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _AGAIN = "run the experiment again with --overwrite"
 class AccuracyData:
     """Lists of a configuration against the truth: of each cell `length` of them from `first` on, at `start` in values.
 
-    `first` counts in the instants of the cell's log and run, `available_s[of_place[place]]`; they are those of the log
-    in all runs unless `by_run`, where runs differ in their units.
+    `first` counts in the instants of the cell's run, `available_s[of_run[run]]`; they are the same in all runs unless
+    `by_run`, where runs differ in their units.
     """
 
     start: Int  # (N·S,)
@@ -37,19 +37,17 @@ class AccuracyData:
     error_m: Float  # (V,) NaN: not matched
     gospa: Float  # (V,) this object's part of GOSPA to its power; NaN: before the onset
     available_s: tuple[Float, ...]  # (K,) each
-    of_place: Int  # (L·S,)
+    of_run: Int  # (S,)
     by_run: bool
 
 
 @dataclass(frozen=True)
 class Ghosts:
-    """Entries of a configuration at no object, by place; `at`: of at least each existence, without stale ones."""
+    """Entries of a configuration at no object, by run."""
 
-    there: Bool  # (L·S,)
-    minutes: Float  # (L·S,)
-    count: Int  # (L·S,)
-    existence: Float  # (T,) ascending
-    at: Int  # (L·S, T)
+    there: Bool  # (S,)
+    minutes: Float  # (S,)
+    count: Int  # (S,)
 
 
 @dataclass(frozen=True)
@@ -81,14 +79,16 @@ class ConfigurationData:
     steps: StepData | None
 
 
-def side_of(one: Named, grid: Grid) -> ConfigurationData:
-    """Lay a configuration out. Raises InputError where its tables are damaged or don't go together."""
+def rows_of(one: Named, tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
+    """What tables of a log say of a configuration."""
     import pyarrow.compute as pc
 
-    results = one.results
-    mine = {
-        name: table.filter(pc.equal(table["configuration"], one.configuration)) for name, table in results.arrow.items()
-    }
+    return {name: table.filter(pc.equal(table["configuration"], one.configuration)) for name, table in tables.items()}
+
+
+def side_of(one: Named, tables: dict[str, pa.Table], grid: Grid) -> ConfigurationData:
+    """Lay out what a log's tables say of a configuration. Raises InputError: they are damaged or don't go together."""
+    results, mine = one.results, rows_of(one, tables)
     rows = mine["detections.parquet"]
     cell = grid.cells(rows)
     place = results.folder / "detections.parquet"
@@ -98,7 +98,7 @@ def side_of(one: Named, grid: Grid) -> ConfigurationData:
         if (np.isnan(number(rows[name])) & wanted).any():
             raise InputError(f"{place}: column {name}: expected a number in every row, found none in some; {_AGAIN}")
     braking = results.provenance.braking is not None
-    size = len(grid.object_of)
+    size = len(grid.objects) * grid.runs
     return ConfigurationData(
         label=one.label,
         path=results.folder,
@@ -154,16 +154,13 @@ def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) 
     by_run, until = "run" in instants.column_names, np.cumsum(counts)
     times_s = [flat_s[until[k] - counts[k] : until[k]] for k in range(len(counts))]
     available_s = (*times_s, np.empty(0))  # the last: none
-    of_place = np.full(len(grid.logs) * grid.runs, len(counts))
-    of_row = grid.places(instants) if by_run else grid.log_numbers(instants)
-    there = np.flatnonzero(of_row >= 0)
+    of_run = np.full(grid.runs, -1 if by_run else len(counts) - 1)  # −1: the last, none
     if by_run:
-        of_place[of_row[there]] = there
-    else:
-        of_place.reshape(len(grid.logs), grid.runs)[of_row[there]] = there[:, None]
-    first, size = whole(rows["first_list"]), len(grid.object_of)
+        run = grid.runs_of(instants)
+        of_run[run[run >= 0]] = np.flatnonzero(run >= 0)
+    first, size = whole(rows["first_list"]), len(grid.objects) * grid.runs
     kept = cell >= 0
-    last = np.array([len(times) for times in available_s], dtype=np.int64)[of_place[grid.place_of[cell[kept]]]]
+    last = np.array([len(times) for times in available_s], dtype=np.int64)[of_run[cell[kept] % grid.runs]]
     if (first[kept] < 0).any() or ((first + length)[kept] > last)[length[kept] > 0].any():
         raise InputError(f"{place}: expected lists of instants.parquet, found more; {_AGAIN}")
     start = np.cumsum(length) - length
@@ -175,7 +172,7 @@ def _accuracy(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: Grid) 
         error_m=error_m,
         gospa=gospa,
         available_s=available_s,
-        of_place=of_place,
+        of_run=of_run,
         by_run=by_run,
     )
 
@@ -184,28 +181,12 @@ def _ghosts(place: Path, tables: dict[str, pa.Table], grid: Grid, configuration:
     if "lists.parquet" not in tables:
         return None
     rows = tables["lists.parquet"]
-    at_place, size = grid.places(rows), len(grid.logs) * grid.runs
-    _check_once(place, at_place, configuration)
-    steps, existence = lists(rows["existence"])
-    counts, ghosts_at = lists(rows["ghosts_at"])
-    count = int(steps[0]) if len(steps) else 0
-    alike = (steps == count).all() and (counts == count).all()
-    if (
-        not alike
-        or (existence.reshape(len(steps), count) != existence[:count]).any()
-        or (np.diff(existence[:count]) <= 0).any()
-    ):
-        raise InputError(
-            f"{place}: expected the same ascending existence and as many ghosts_at in all rows, found others; {_AGAIN}"
-        )
-    at = np.zeros((size, count), dtype=np.int64)
-    at[at_place[at_place >= 0]] = ghosts_at.reshape(len(steps), count)[at_place >= 0]
+    run = grid.runs_of(rows)
+    _check_once(place, run, configuration)
     return Ghosts(
-        there=_laid(np.ones(len(at_place), dtype=bool), at_place, size),
-        minutes=_laid(number(rows["minutes"]), at_place, size),
-        count=_laid(whole(rows["ghosts"]), at_place, size),
-        existence=existence[:count],
-        at=at,
+        there=_laid(np.ones(len(run), dtype=bool), run, grid.runs),
+        minutes=_laid(number(rows["minutes"]), run, grid.runs),
+        count=_laid(whole(rows["ghosts"]), run, grid.runs),
     )
 
 

@@ -35,6 +35,6 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
 
 def _read(one: Path | Results) -> Results:
     results = one if isinstance(one, Results) else open_results(one)
-    for name in ("arrow", "source"):
+    for name in ("by_log", "source"):
         getattr(results, name)
     return results

@@ -45,8 +45,7 @@ def named(folders: Sequence[Results]) -> list[Named]:
 
 def _configurations(results: Results) -> list[str]:
     """Names of the configurations that have rows, in their order."""
-    names: list[str] = results.arrow["detections.parquet"]["configuration"].unique().to_pylist()
-    return names
+    return list(results.by_log["detections.parquet"].configurations)
 
 
 def chosen(known: Sequence[Named], configurations: Sequence[str] | None, baseline: str | None) -> tuple[Named, ...]:

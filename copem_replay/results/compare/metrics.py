@@ -19,15 +19,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.summary_metrics import METRIC
 from copem_replay.metrics.survival import CENSORED, DETECTED, LEFT
-from copem_replay.results.compare.bootstrap import Whose
-from copem_replay.results.compare.configuration_data import ConfigurationData, Ghosts, StepData
-from copem_replay.results.compare.differences import Figure, OfMedians, OfSums, OfTimes, Times
+from copem_replay.results.compare.bootstrap import Items
+from copem_replay.results.compare.configuration_data import ConfigurationData, StepData
+from copem_replay.results.compare.differences import Figure, OfMedians, OfSums, OfTimes
+from copem_replay.results.compare.equal_ghosts import Kept
 from copem_replay.results.compare.pairing import Grid
 from copem_replay.results.compare.per_list import together
 
@@ -40,21 +43,11 @@ METRICS = {name: METRIC[name.removesuffix("_equal_ghosts")].better for name in (
 
 @dataclass(frozen=True)
 class Setting:
-    """How all pairs are measured: the horizon, GOSPA's power, and at how many ghosts per minute times are compared."""
+    """How a pair is measured: the horizon, GOSPA's power, and what is kept of each side's entries for equal ghosts."""
 
     horizon_s: float
     power: float
-    false_positives_per_min: float | None
-
-
-@dataclass(frozen=True)
-class Kept:
-    """Entries of at least `existence` are listed in a share of the drives, in the rest those of at least `above`."""
-
-    existence: float
-    above: float  # inf: nothing
-    share: float
-    false_positives_per_min: float
+    kept: tuple[Kept, Kept] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,49 +59,148 @@ class Regret:
     kept: tuple[Kept, Kept] | None = None
 
 
+@dataclass(frozen=True)
+class _Pair:
+    """Two sides in a log, and the cells (C,) that both have."""
+
+    first: ConfigurationData
+    second: ConfigurationData
+    grid: Grid
+    cells: Int
+    setting: Setting
+
+    @property
+    def sides(self) -> tuple[ConfigurationData, ConfigurationData]:
+        return self.first, self.second
+
+    @property
+    def runs(self) -> Int:
+        """(C,) the run of each cell."""
+        found: Int = self.cells % self.grid.runs
+        return found
+
+    def items(self, cells: Int, **columns: NDArray[Any]) -> Items:
+        """An item for each of some cells, −1 − r: of run r and no object."""
+        objects = np.where(cells < 0, -1, cells // self.grid.runs + self.grid.before)
+        runs = np.where(cells < 0, -1 - cells, cells % self.grid.runs)
+        numbers = {"logs": np.full(len(cells), self.grid.log_ix), "objects": objects, "runs": runs}
+        n = {"n": np.ones(len(cells), dtype=np.int64)}
+        return Items({name: of.astype(np.int32) for name, of in numbers.items()} | n | columns)
+
+
 def regrets(
     first: ConfigurationData, second: ConfigurationData, grid: Grid, setting: Setting, only: Sequence[str] | None = None
 ) -> Iterator[Regret]:
-    """Every metric, or only some, that both sides have what it takes for."""
-    cells = np.flatnonzero(first.there & second.there)
+    """Every metric of a log, or only some, that both sides have what it takes for."""
+    pair = _Pair(first, second, grid, np.flatnonzero(first.there & second.there), setting)
     for names, made in _METRICS.items():
         if only is None or not set(names).isdisjoint(only):
-            yield from (one for one in made(first, second, grid, cells, setting) if only is None or one.metric in only)
+            yield from (one for one in made(pair) if only is None or one.metric in only)
 
 
-def _of_detections(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
-) -> Iterator[Regret]:
-    yield Regret("detected_share", _shares(grid, cells, first.detected[cells], second.detected[cells]))
-    times = [(_times(side, side.detection_s, cells),) for side in (first, second)]
-    yield Regret("ttd_rmst_s", _restricted_means(grid, cells, times[0], times[1], setting))
+def _of_detections(pair: _Pair) -> Iterator[Regret]:
+    yield Regret("detected_share", _shares(pair, pair.cells, *(side.detected[pair.cells] for side in pair.sides)))
+    times = [((1.0, side.detection_s),) for side in pair.sides]
+    yield Regret("ttd_rmst_s", _restricted_means(pair, times))
 
 
-def _of_distances(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
-) -> Iterator[Regret]:
-    yield Regret("dad_median_m", _distances(first, second, grid, cells))
+def _at_equal_ghosts(pair: _Pair) -> Iterator[Regret]:
+    if pair.setting.kept is None:
+        return
+    times = []
+    for side, kept in zip(pair.sides, pair.setting.kept, strict=True):
+        parts = ((kept.share, kept.existence), (1.0 - kept.share, kept.above))
+        assert side.steps is not None
+        times.append([(share, _detected_s(side.steps, limit, len(side.there))) for share, limit in parts if share > 0])
+    yield Regret("ttd_rmst_s_equal_ghosts", _restricted_means(pair, times), pair.setting.kept)
 
 
-def _of_ghosts(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
-) -> Iterator[Regret]:
-    if first.ghosts is not None and second.ghosts is not None:
-        yield Regret("false_positives_per_min", _ghosts(first, second, first.ghosts, second.ghosts, grid, cells))
+def _detected_s(steps: StepData, existence: float, cells: int) -> Float:
+    """(C,) when each cell is detected by entries of at least some existence; NaN: never."""
+    detection_s = np.full(cells, np.inf)
+    enough = steps.existence >= existence
+    np.minimum.at(detection_s, steps.cell[enough], steps.detection_s[enough])
+    return np.where(np.isinf(detection_s), np.nan, detection_s)
 
 
-def _of_braking(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
-) -> Iterator[Regret]:
+def _restricted_means(pair: _Pair, times: Sequence[Sequence[tuple[float, Float]]]) -> OfTimes:
+    """Of times of detection (N·S,), NaN: not, with their shares of the drives, of both sides."""
+    shares, parts = [], []
+    for side, sign, of_side in zip(pair.sides, (1.0, -1.0), times, strict=True):
+        for share, detection_s in of_side:
+            shares.append(sign * share)
+            parts.append(_times(pair, side, detection_s[pair.cells]))
+    return OfTimes(parts=tuple(parts), shares=tuple(shares), horizon_s=pair.setting.horizon_s)
+
+
+def _times(pair: _Pair, side: ConfigurationData, detection_s: Float) -> Items:
+    """To a nanosecond, as in summary."""
+    cells, detected = pair.cells, ~np.isnan(detection_s)
+    time_s = np.where(detected, detection_s, side.ended_s[cells]) - side.onset_s[cells]
+    ending = np.where(detected, DETECTED, np.where(side.left[cells], LEFT, CENSORED)).astype(np.int8)
+    return pair.items(cells, time_s=np.round(time_s, 9), ending=ending)
+
+
+def _of_distances(pair: _Pair) -> Iterator[Regret]:
+    first, second = (np.where(side.detected, side.distance_m, -np.inf)[pair.cells] for side in pair.sides)
+    placed = ~np.isnan(first + second)  # NaN: detected during a gap of the truth, no distance to rank
+    items = pair.items(pair.cells[placed], first=first[placed], second=second[placed])
+    yield Regret("dad_median_m", OfMedians(parts=(items,)))
+
+
+def _of_lists(pair: _Pair) -> Iterator[Regret]:
+    """Errors and GOSPA; lists are of no object in particular, so that their number stays when objects are resampled."""
+    if pair.first.accuracy is None or pair.second.accuracy is None:
+        return
+    both = together(pair.first.accuracy, pair.second.accuracy, pair.grid, pair.cells)
+    k = both.matched > 0
+    squares = np.concatenate([both.squared_m2, both.matched[:, None]], axis=1)[k]
+    errors = pair.items(pair.cells[k], n=both.matched[k], sums=squares)
+    yield Regret("position_rmse_m", OfSums(parts=(errors,), of=_root(2.0)))
+    there = both.measured > 0
+    parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[there]
+    items = _with_runs(pair, pair.cells[there], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
+    yield Regret("gospa_m", OfSums(parts=(items,), of=_root(pair.setting.power)))
+
+
+def _of_ghosts(pair: _Pair) -> Iterator[Regret]:
+    """Ghosts over minutes; those that are nearest to no measured object are of their list only."""
+    ghosts, others = pair.first.ghosts, pair.second.ghosts
+    if ghosts is None or others is None:
+        return
+    there = ghosts.there & others.there
+    cells, runs = pair.cells[there[pair.runs]], pair.runs[there[pair.runs]]
+    nearest = np.zeros((len(cells), 4))
+    rest = np.stack([ghosts.count, others.count, ghosts.minutes, others.minutes], axis=1).astype(float)
+    rest[~there] = 0.0
+    accuracy = [side.accuracy for side in pair.sides if side.accuracy is not None]
+    for k, of in enumerate(accuracy if len(accuracy) == 2 else ()):
+        nearest[:, k] = of.ghosts[cells]
+        rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
+    items = _with_runs(pair, cells, nearest, rest, there.astype(np.int64))
+    yield Regret("false_positives_per_min", OfSums(parts=(items,), by_object=len(accuracy) == 2, of=_rates))
+
+
+def _of_braking(pair: _Pair) -> Iterator[Regret]:
+    first, second, cells = pair.first, pair.second, pair.cells
     if first.conflict is not None and second.conflict is not None:
         assert first.passes is not None
         assert second.passes is not None
         judged = cells[first.conflict[cells] & second.conflict[cells]]
-        yield Regret("pass_share", _shares(grid, judged, first.passes[judged], second.passes[judged]))
+        yield Regret("pass_share", _shares(pair, judged, first.passes[judged], second.passes[judged]))
 
 
-def _whose(grid: Grid, cells: Int) -> Whose:
-    return Whose(grid.log_of[cells], grid.object_of[cells], grid.run_of[cells])
+def _shares(pair: _Pair, cells: Int, first: Bool, second: Bool) -> OfSums:
+    only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
+    sums = np.stack([first, second, np.ones(len(cells))], axis=1)
+    return OfSums(parts=(pair.items(cells, only=only, sums=sums),), of=_mean)
+
+
+def _with_runs(pair: _Pair, cells: Int, of_cells: Float, of_runs: Float, n: Int) -> Items:
+    """Items of cells, then of all runs that count for something (`n (S,)`)."""
+    at = np.flatnonzero(n)
+    counts = np.concatenate([np.zeros(len(cells), dtype=np.int64), n[at]])
+    return pair.items(np.concatenate([cells, -1 - at]), n=counts, sums=np.concatenate([of_cells, of_runs[at]]))
 
 
 def _mean(sums: Float) -> tuple[Float, Float]:
@@ -123,156 +215,8 @@ def _root(power: float) -> Callable[[Float], tuple[Float, Float]]:
     return of
 
 
-def _means(grid: Grid, cells: Int, first: Float, second: Float, only: Int | None = None) -> OfSums:
-    ones = np.ones(len(cells))
-    return OfSums(
-        whose=_whose(grid, cells),
-        n=ones.astype(np.int64),
-        only=only,
-        sums=np.stack([first, second, ones], axis=1),
-        of=_mean,
-    )
-
-
-def _shares(grid: Grid, cells: Int, first: Bool, second: Bool) -> OfSums:
-    only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
-    return _means(grid, cells, first.astype(float), second.astype(float), only)
-
-
-def _times(side: ConfigurationData, detection_s: Float, cells: Int, share: float = 1.0) -> Times:
-    """Times of cells (C,), detected at `detection_s (N·S,)` or, NaN, not. To a nanosecond, as in summary."""
-    onset_s, detected = side.onset_s[cells], ~np.isnan(detection_s[cells])
-    time_s = np.where(detected, detection_s[cells], side.ended_s[cells]) - onset_s
-    ending = np.where(detected, DETECTED, np.where(side.left[cells], LEFT, CENSORED))
-    return Times(share, np.round(time_s, 9), ending)
-
-
-def _restricted_means(
-    grid: Grid, cells: Int, first: tuple[Times, ...], second: tuple[Times, ...], setting: Setting
-) -> OfTimes:
-    return OfTimes(
-        whose=_whose(grid, cells),
-        n=np.ones(len(cells), dtype=np.int64),
-        first=first,
-        second=second,
-        horizon_s=setting.horizon_s,
-    )
-
-
-def kept_at(ghosts: Ghosts, per_min: float) -> Kept | None:
-    """What is listed with so many ghosts per minute, or with fewer where all have fewer; None: there is no minute."""
-    minutes = float(ghosts.minutes[ghosts.there].sum())
-    if minutes <= 0 or not len(ghosts.existence):
-        return None
-    rates = np.append(ghosts.at[ghosts.there].sum(axis=0) / minutes, 0.0)
-    limits = np.append(ghosts.existence, np.inf)
-    k = int(np.argmax(rates <= per_min * (1 + 1e-9)))
-    if k == 0 or rates[k] >= per_min * (1 - 1e-9):
-        return Kept(float(limits[k]), float(limits[k]), 1.0, float(rates[k]))
-    share = float((per_min - rates[k]) / (rates[k - 1] - rates[k]))
-    return Kept(float(limits[k - 1]), float(limits[k]), share, per_min)
-
-
-def own_rate(ghosts: Ghosts) -> float | None:
-    """Ghosts per minute at the lowest existence there is, without stale ones."""
-    minutes = float(ghosts.minutes[ghosts.there].sum())
-    return float(ghosts.at[ghosts.there, 0].sum()) / minutes if len(ghosts.existence) and minutes > 0 else None
-
-
-def _at_equal_ghosts(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
-) -> Iterator[Regret]:
-    kept, times = [], []
-    for side in (first, second):
-        if side.ghosts is None or side.steps is None or setting.false_positives_per_min is None:
-            return
-        found = kept_at(side.ghosts, setting.false_positives_per_min)
-        if found is None:
-            return
-        kept.append(found)
-        parts = ((found.share, found.existence), (1.0 - found.share, found.above))
-        size = len(grid.object_of)
-        times.append(
-            tuple(
-                _times(side, _detected_s(side.steps, limit, size), cells, share) for share, limit in parts if share > 0
-            )
-        )
-    figure = _restricted_means(grid, cells, times[0], times[1], setting)
-    yield Regret("ttd_rmst_s_equal_ghosts", figure, (kept[0], kept[1]))
-
-
-def _detected_s(steps: StepData, existence: float, cells: int) -> Float:
-    """(C,) when each cell is detected by entries of at least some existence; NaN: never."""
-    detection_s = np.full(cells, np.inf)
-    enough = steps.existence >= existence
-    np.minimum.at(detection_s, steps.cell[enough], steps.detection_s[enough])
-    return np.where(np.isinf(detection_s), np.nan, detection_s)
-
-
-def _distances(first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int) -> OfMedians:
-    known = [np.where(side.detected[cells], side.distance_m[cells], -np.inf) for side in (first, second)]
-    placed = ~np.isnan(known[0] + known[1])  # NaN: detected during a gap of the truth, no distance to rank
-    return OfMedians(
-        whose=_whose(grid, cells[placed]),
-        n=np.ones(int(placed.sum()), dtype=np.int64),
-        first=known[0][placed],
-        second=known[1][placed],
-    )
-
-
-def _of_lists(
-    first: ConfigurationData, second: ConfigurationData, grid: Grid, cells: Int, setting: Setting
-) -> Iterator[Regret]:
-    """Errors and GOSPA; lists are of no object in particular, so that their number stays when objects are resampled."""
-    if first.accuracy is None or second.accuracy is None:
-        return
-    both = together(first.accuracy, second.accuracy, grid, cells)
-    squares = np.concatenate([both.squared_m2, both.matched[:, None]], axis=1)
-    of_errors = OfSums(whose=_whose(grid, cells), n=both.matched, sums=squares, of=_root(2.0))
-    yield Regret("position_rmse_m", of_errors.take(both.matched > 0))
-    there = both.measured > 0
-    parts = np.concatenate([both.gospa, np.zeros((len(cells), 1))], axis=1)[there]
-    whose, sums, n = _with_places(grid, cells[there], parts, np.outer(both.lists, [0.0, 0.0, 1.0]), both.lists)
-    yield Regret("gospa_m", OfSums(whose=whose, n=n, sums=sums, of=_root(setting.power)))
-
-
-def _ghosts(
-    first: ConfigurationData, second: ConfigurationData, ghosts: Ghosts, others: Ghosts, grid: Grid, cells: Int
-) -> OfSums:
-    """Ghosts over minutes; those that are nearest to no measured object are of their list only."""
-    there = ghosts.there & others.there
-    cells = cells[there[_places(grid, cells)]]
-    nearest = np.zeros((len(cells), 4))
-    by_object = first.accuracy is not None and second.accuracy is not None
-    rest = np.stack([ghosts.count, others.count, ghosts.minutes, others.minutes], axis=1).astype(float)
-    rest[~there] = 0.0
-    for k, side in enumerate((first, second)):
-        if by_object and side.accuracy is not None:
-            nearest[:, k] = side.accuracy.ghosts[cells]
-            rest[:, k] -= np.bincount(_places(grid, cells), nearest[:, k], minlength=len(rest))
-    whose, sums, n = _with_places(grid, cells, nearest, rest, there.astype(np.int64))
-    return OfSums(whose=whose, n=n, sums=sums, by_object=by_object, of=_rates)
-
-
 def _rates(sums: Float) -> tuple[Float, Float]:
     return sums[..., 0] / sums[..., 2], sums[..., 1] / sums[..., 3]
-
-
-def _places(grid: Grid, cells: Int) -> Int:
-    places: Int = grid.log_of[cells] * grid.runs + grid.run_of[cells]
-    return places
-
-
-def _with_places(grid: Grid, cells: Int, of_cells: Float, of_places: Float, n: Int) -> tuple[Whose, Float, Int]:
-    """Items of cells, then of all places that count for something (`n (L·S,)`): of a log and a run, of no object."""
-    at = np.flatnonzero(n)
-    whose = Whose(
-        np.concatenate([grid.log_of[cells], at // grid.runs]),
-        np.concatenate([grid.object_of[cells], np.full(len(at), -1)]),
-        np.concatenate([grid.run_of[cells], at % grid.runs]),
-    )
-    counts = np.concatenate([np.zeros(len(cells), dtype=np.int64), n[at]])
-    return whose, np.concatenate([of_cells, of_places[at]]), counts
 
 
 _METRICS = {

@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import Bool
 from copem_replay.metrics.intervals import FEWEST_CLUSTERS
-from copem_replay.results.compare.configuration_data import ConfigurationData
 from copem_replay.results.compare.labels import Named
-from copem_replay.results.compare.per_list import shared_instants
 from copem_replay.results.tables import OPTIONAL
 
 if TYPE_CHECKING:
+    from copem_replay.results.compare.all_logs import AllLogs
     from copem_replay.results.read import Results
 
 _NEEDED = {
@@ -33,7 +32,7 @@ def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
         has = ", ".join(f"{path} {count}" for path, count in runs.items())
         yield f"other numbers of runs ({has}): the first {min(runs.values())} are compared"
     for folder in folders:
-        missing = [name for name in OPTIONAL if name not in folder.arrow]
+        missing = [name for name in OPTIONAL if name not in folder.by_log]
         metrics = [metric for metric, files in _NEEDED.items() if files & set(missing)]
         if metrics:
             yield (
@@ -46,28 +45,23 @@ def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
         yield f"{without}: no braking: pass_share is compared only among those that have it"
 
 
-def notes_on_pairs(baseline: str, baseline_there: Bool, there: Mapping[str, Bool]) -> Iterator[str]:
+def notes_on_pairs(baseline: Named, pairs: Mapping[Named, AllLogs]) -> Iterator[str]:
     """Rows without a partner."""
-    for label, mine in there.items():
-        for whose, count in ((label, (mine & ~baseline_there).sum()), (baseline, (baseline_there & ~mine).sum())):
+    for one, pair in pairs.items():
+        counts = np.sum(pair.alone, axis=0).tolist()
+        for (whose, other), count in zip(((one, baseline), (baseline, one)), counts, strict=True):
             if count:
-                other = baseline if whose is label else label
-                yield f"{counted(int(count), 'row')} of {whose} left out: {other} has no such object"
+                yield f"{counted(count, 'row')} of {whose.label} left out: {other.label} has no such object"
 
 
-def notes_on_instants(
-    baseline: ConfigurationData, others: Sequence[ConfigurationData], logs: Sequence[str]
-) -> Iterator[str]:
+def notes_on_instants(baseline: Named, pairs: Mapping[Named, AllLogs], logs: Sequence[str]) -> Iterator[str]:
     """Lists that have no list of the other configuration at the same instant."""
     alike: dict[tuple[int, int, int, str], list[str]] = {}
-    for side in others:
-        if side.accuracy is None or baseline.accuracy is None:
-            continue
-        shared, *of_each = shared_instants(side.accuracy, baseline.accuracy, len(logs))
-        mine, theirs = (int(of.sum()) for of in of_each)
-        if shared.sum() < max(mine, theirs):
-            none = ", ".join(name for name, number in zip(logs, shared, strict=True) if number == 0)
-            alike.setdefault((int(shared.sum()), mine, theirs, none if len(logs) > 1 else ""), []).append(side.label)
+    for one, pair in pairs.items():
+        shared, mine, theirs = np.sum(pair.instants, axis=0).tolist() if pair.instants else (0, 0, 0)
+        if shared < max(mine, theirs):
+            none = ", ".join(log for log, counts in zip(logs, pair.instants, strict=True) if counts[0] == 0)
+            alike.setdefault((shared, mine, theirs, none if len(logs) > 1 else ""), []).append(one.label)
     for (number, mine, theirs, none), labels in alike.items():
         lacking = f"; none in {none}" if none else ""
         yield (

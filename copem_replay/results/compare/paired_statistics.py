@@ -7,7 +7,7 @@
 replacement, both sides of a pair together: so what both have in common cancels, as it does in the difference.
 *Median*: the smallest value that at least half of the weight is at or below: the value of some pair.
 
-Letters of the shapes: n pairs, K clusters, R resamples, m sums. Every function raises ValueError when shapes or values
+Letters of the shapes: i items, K clusters, R resamples, m sums. Every function raises ValueError when shapes or values
 are not as said: that is a defect of the caller.
 """
 
@@ -61,8 +61,9 @@ def resampled_sums(sums: Float, count: NDArray[np.unsignedinteger[Any]]) -> Floa
     return of_all
 
 
-def resampled_medians(values: Float, cluster: Int, count: NDArray[np.unsignedinteger[Any]]) -> Float:
-    """(R,) median of each resample: `values (n,)`, those of `cluster (n,)` drawn `count (R, K)` times.
+def resampled_medians(values: Float, cluster: Int, count: NDArray[np.unsignedinteger[Any]], n: Int) -> Float:
+    """(R,) median of each resample: `values (i,)`, `n (i,)` times each, those of `cluster (i,)` drawn
+    `count (R, K)` times.
 
     Values may be infinite; NaN where a resample has no value. Raises ValueError for NaN, or other shapes.
     """
@@ -73,13 +74,13 @@ def resampled_medians(values: Float, cluster: Int, count: NDArray[np.unsignedint
     if not len(values):
         return np.full(R, np.nan)
     order = np.argsort(values, kind="stable")
-    ranked, of = values[order], cluster[order]
-    # In two steps: which of about √n blocks of neighbours the median is in, then where in the block. All counts are
+    ranked, of, times = values[order], cluster[order], n[order]
+    # In two steps: which of about √i blocks of neighbours the median is in, then where in the block. All counts are
     # whole numbers, which floats hold exactly.
-    n = len(values)
-    length = max(1, math.isqrt(n))
-    blocks = -(-n // length)
-    in_block = np.bincount(of * blocks + np.arange(n) // length, minlength=K * blocks).reshape(K, blocks).astype(float)
+    items = len(values)
+    length = max(1, math.isqrt(items))
+    blocks = -(-items // length)
+    in_block = np.bincount(of * blocks + np.arange(items) // length, times, minlength=K * blocks).reshape(K, blocks)
     until = np.empty((R, blocks))
     size = max(1, _CELLS // K)
     for r in range(0, R, size):
@@ -88,9 +89,9 @@ def resampled_medians(values: Float, cluster: Int, count: NDArray[np.unsignedint
     block = np.argmax(2 * until >= total[:, None], axis=1)
     before = np.where(block > 0, until[np.arange(R), np.maximum(block - 1, 0)], 0.0)
     place = block[:, None] * length + np.arange(length)
-    there = place < n
-    place = np.minimum(place, n - 1)
-    weight = np.where(there, count[np.arange(R)[:, None], of[place]], 0)
+    there = place < items
+    place = np.minimum(place, items - 1)
+    weight = np.where(there, count[np.arange(R)[:, None], of[place]] * times[place], 0)
     reached = 2 * (before[:, None] + np.cumsum(weight, axis=1)) >= total[:, None]
     found = ranked[place[np.arange(R), np.argmax(reached, axis=1)]]
     return np.where(total > 0, found, np.nan)

@@ -28,21 +28,21 @@ class Together:
     squared_m2: Float  # (C, 2) Σ e² over them
     measured: Int  # (C,) lists in which the object of the cell is measured
     gospa: Float  # (C, 2) Σ of its parts of GOSPA over them
-    lists: Int  # (L·S,) shared lists in which an object of the cells is measured
+    lists: Int  # (S,) shared lists in which an object of the cells is measured
 
 
 def together(first: AccuracyData, second: AccuracyData, grid: Grid, cells: Int) -> Together:
     """Pair the lists of cells (C,)."""
-    places = len(grid.logs) * grid.runs
-    other, offset = _same_instants(first, second, np.arange(places))
+    run_of = cells % grid.runs
+    other, offset = _same_instants(first, second, np.arange(grid.runs))
     most = max((len(times) for times in first.available_s), default=0)
     matched, measured = np.zeros((2, len(cells)), dtype=np.int64)
     squared, gospa = np.zeros((2, len(cells), 2))
-    seen = np.zeros(places * most, dtype=bool)
+    seen = np.zeros(grid.runs * most, dtype=bool)
     until = np.cumsum(first.length[cells])
     bounds = np.searchsorted(until, np.arange(_VALUES, int(until[-1]) if len(until) else 0, _VALUES))
     for part in np.split(np.arange(len(cells)), bounds):
-        row, at, number, same = _aligned(first, second, other, offset[grid.place_of[cells]], cells, part)
+        row, at, number, same = _aligned(first, second, other, offset[run_of], cells, part)
         both = [side.error_m[k].astype(float) for side, k in ((first, at), (second, same))]
         k = ~np.isnan(both[0] + both[1])
         matched += np.bincount(row[k], minlength=len(cells))
@@ -52,33 +52,23 @@ def together(first: AccuracyData, second: AccuracyData, grid: Grid, cells: Int) 
         for side in (0, 1):
             squared[:, side] += np.bincount(row[k], both[side][k] ** 2, minlength=len(cells))
             gospa[:, side] += np.bincount(row[g], parts[side][g], minlength=len(cells))
-        place = grid.place_of[cells[row[g]]]
-        seen[place * most + number[g]] = True
-    return Together(matched, squared, measured, gospa, seen.reshape(places, most).sum(axis=1))
+        seen[run_of[row[g]] * most + number[g]] = True
+    return Together(matched, squared, measured, gospa, seen.reshape(grid.runs, most).sum(axis=1))
 
 
-def instants(side: AccuracyData, logs: int, *, by_run: bool) -> Int:
-    """(L,) how many instants each log has, of all its runs if `by_run`."""
-    counts = np.array([len(times) for times in side.available_s])[side.of_place].reshape(logs, -1)
-    found: Int = counts.sum(axis=1) if by_run else counts[:, 0]
-    return found
-
-
-def shared_instants(first: AccuracyData, second: AccuracyData, logs: int) -> tuple[Int, Int, Int]:
-    """(L,) how many instants of each log both have, and how many each; of all runs where those of a side differ."""
-    by_run = first.by_run or second.by_run
-    places = np.arange(len(first.of_place)).reshape(logs, -1)
-    places = places if by_run else places[:, :1]
-    other, offset = _same_instants(first, second, places.ravel())
-    length = np.array([len(times) for times in first.available_s])[first.of_place[places.ravel()]]
+def shared_instants(first: AccuracyData, second: AccuracyData) -> Int:
+    """(3,) how many instants of the log both have, and how many each; of all runs where those of a side differ."""
+    sides = (first, second)
+    runs = np.arange(len(first.of_run) if first.by_run or second.by_run else 1)
+    other, offset = _same_instants(first, second, runs)
+    counts = [np.array([len(times) for times in side.available_s])[side.of_run[runs]] for side in sides]
     has = np.append(0, np.cumsum(other >= 0))
-    both = (has[offset + length] - has[offset]).reshape(places.shape).sum(axis=1)
-    return both, instants(first, logs, by_run=by_run), instants(second, logs, by_run=by_run)
+    return np.array([(has[offset + counts[0]] - has[offset]).sum(), *(count.sum() for count in counts)])
 
 
-def _same_instants(first: AccuracyData, second: AccuracyData, places: Int) -> tuple[Int, Int]:
-    """For instants of the first their numbers in the second, −1: none; and where those of each place (R,) begin."""
-    pairs, which = np.unique(np.stack([first.of_place[places], second.of_place[places]]), axis=1, return_inverse=True)
+def _same_instants(first: AccuracyData, second: AccuracyData, runs: Int) -> tuple[Int, Int]:
+    """For instants of the first their numbers in the second, −1: none; and where those of each run (R,) begin."""
+    pairs, which = np.unique(np.stack([first.of_run[runs], second.of_run[runs]]), axis=1, return_inverse=True)
     found = []
     for mine, others in pairs.T.tolist():
         mine_s, other_s = first.available_s[mine], second.available_s[others]

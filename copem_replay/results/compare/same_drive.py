@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from copem_replay.results.compare.labels import Named
     from copem_replay.results.read import LogFile, Results
 
@@ -52,15 +50,8 @@ def renamed(folders: Sequence[Results]) -> tuple[list[Results], dict[Results, di
 def _with_names(results: Results, to: Mapping[str, str]) -> Results:
     logs = tuple(replace(log, name=to.get(log.name, log.name)) for log in results.provenance.logs)
     copy = replace(results, provenance=replace(results.provenance, logs=logs))
-    vars(copy)["arrow"] = {name: _named(table, to) for name, table in results.arrow.items()}
+    vars(copy)["by_log"] = {name: rows.renamed(to) for name, rows in results.by_log.items()}
     return copy
-
-
-def _named(table: pa.Table, to: Mapping[str, str]) -> pa.Table:
-    import pyarrow as pa
-
-    names = [to.get(name, name) for name in table["log"].to_pylist()]
-    return table.set_column(table.column_names.index("log"), "log", pa.array(names, pa.string()))
 
 
 def check_names(against: Named, others: Sequence[Named], names: Mapping[Results, Mapping[str, str]]) -> None:
