@@ -24,7 +24,7 @@ _LIBRARIES = (
     "scipy", "shapely",
 )  # fmt: skip
 ROWS_A_GROUP = 1 << 17
-"""Rows of a row group of Parquet, at most (chosen: comparisons read whole ones, of accuracy with a list in each row)."""
+"""Rows of a row group of Parquet, at most (chosen: comparisons read whole ones, also of lists per row)."""
 
 
 def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:

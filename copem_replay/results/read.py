@@ -230,11 +230,13 @@ class Results:
         return [path for log in self.provenance.logs if (path := file_of(place, log.name)).is_file()]
 
     def _frame(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
-        def parquet(place: Path) -> pd.DataFrame:
-            files = self._files(place)
-            return pd.concat(map(pd.read_parquet, files), ignore_index=True) if files else pd.read_parquet(place)
+        def as_frame(place: Path) -> pd.DataFrame:
+            from pyarrow import parquet
 
-        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else parquet, columns)
+            table = parquet.read_table(self._files(place) or place)
+            return table.to_pandas(split_blocks=True, self_destruct=True)  # column by column, none of them twice
+
+        table = read_frame(self.folder / name, read_csv if name.endswith(".csv") else as_frame, columns)
         check_still(self.folder, self.seen)
         return table
 

@@ -1,0 +1,191 @@
+"""Log by log is the same as pair by pair: random studies against plain loops, in files and folders, in any order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyarrow import compute, parquet
+
+from copem_replay.results.compare import compare
+from copem_replay.results.tables import file_of
+from tests.helpers.compare_folders import BRAKING, Row, ghosts, limits_of, row, step, write_folder
+from tests.oracles import compare as oracle
+
+INSTANTS = {"ideal": [0.0, 1.0, 2.0, 3.0], "late": [1.0, 2.0, 2.5, 3.0]}
+
+
+def study(seed: int, logs: int, fewest: int = 0) -> dict[str, Any]:
+    """Rows of every table, on grids: ties, never, gaps, objects that one side lacks, a log without any."""
+    rnd = Random(seed)
+    runs = rnd.randint(1, 3)
+    rows: list[Row] = []
+    for log in "abcdef"[:logs]:
+        for thing in range(rnd.randint(fewest if rows else 1, 3)):
+            of = {"onset_s": rnd.choice([0.0, 1.0]), "ended_s": rnd.choice([6.0, 10.0]), "object_id": str(thing)}
+            of |= {"ended_by": rnd.choice(["object_left", "log_end"]), "log": log, "conflict": rnd.random() < 0.7}
+            rows += [
+                one(rnd, name, run, of)
+                for name in (["ideal", "late"] if not rows or rnd.random() < 0.8 else [rnd.choice(["ideal", "late"])])
+                for run in range(runs)
+            ]
+    lists, steps = [], []
+    for name in ("ideal", "late"):
+        for log in "abcdef"[:logs]:
+            for run in range(runs):
+                near = sum(r["ghosts"] for r in rows if (r["configuration"], r["log"], r["run"]) == (name, log, run))
+                count = near + rnd.randint(0, 30)
+                at = {"existence": [0.0, 0.5], "ghosts_at": [count, rnd.randint(0, count)]}
+                lists.append(ghosts(name, count, log=log, run=run, minutes=rnd.choice([0.25, 0.5, 1.0]), **at))
+    for r in rows:
+        if r["detected"]:
+            seen = {name: r[name] for name in ("log", "run", "object_id")}
+            steps.append(step(r["configuration"], rnd.choice([0.25, 0.75]), r["detection_s"], **seen))
+    names = {log: f"content of {log}" for log in "abcdef"[:logs]}
+    return {"rows": rows, "lists": lists, "steps": steps, "logs": names, "available_s": INSTANTS, "braking": BRAKING}
+
+
+def one(rnd: Random, name: str, run: int, of: Row) -> Row:
+    """A row, and what its lists say."""
+    seen_s = rnd.choice([None, of["onset_s"] + 0.5, of["onset_s"] + 2.0, of["onset_s"] + 2.25])
+    first = rnd.randint(0, 2)
+    size = rnd.randint(0, 4 - first)
+    return row(name, seen_s, rnd.choice([None, 10.0, 20.0, 20.5]), run=run, **of) | {
+        "braking_pass": rnd.random() < 0.5,
+        "first_list": first,
+        "error_m": [rnd.choice([None, 0.5, 1.0, 3.0]) for _ in range(size)],
+        "gospa_m2": [rnd.choice([None, 1.0, 2.25]) for _ in range(size)],
+        "ghosts": rnd.randint(0, 3),
+    }
+
+
+seeds, log_counts = st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 3, 5])
+
+
+@settings(max_examples=25)
+@given(seeds, log_counts)
+def test_figures_are_those_of_pairs_one_by_one(seed, count):
+    given_study = study(seed, count)
+    rows, lists = given_study["rows"], given_study["lists"]
+    with TemporaryDirectory() as scratch:
+        table = compare([write_folder(Path(scratch) / "study", **given_study)]).table
+    logs = list(given_study["logs"])
+    for log in ["all", *(logs if len(logs) > 1 else [])]:
+        there = [log] if log != "all" else logs
+        mine = table[table["log"] == log].set_index("metric")
+        found = [pair for pair in oracle.pairs(rows, "late", "ideal") if pair[0]["log"] in there]
+        judged = [pair for pair in found if pair[0]["conflict"]]
+        both = [of for of in lists if of["log"] in there]
+
+        def is_as(metric: str, expected: Any, n: int, mine: pd.DataFrame = mine) -> None:
+            got = mine.loc[metric, ["value", "baseline_value", "difference"]].tolist()
+            if expected is None:
+                assert np.isnan(np.array(got, dtype=float)).all()
+            else:
+                value, other, *difference = expected
+                wanted = [value, other, *(difference or [value - other])]
+                wanted = [v if np.isfinite(v) else np.nan for v in wanted]
+                assert got == pytest.approx(wanted, abs=1e-9, nan_ok=True), metric
+            assert mine.loc[metric, "n"] == n
+
+        is_as("detected_share", oracle.share(found, "detected") if found else None, len(found))
+        is_as("ttd_rmst_s", oracle.restricted_means(found) if found else None, len(found))
+        is_as("dad_median_m", oracle.medians(found), len(oracle.distances(found)))
+        is_as("pass_share", oracle.share(judged, "braking_pass") if judged else None, len(judged))
+        only = [(pair[0]["braking_pass"], pair[1]["braking_pass"]) for pair in judged]
+        counts = mine.loc["pass_share", ["only_configuration", "only_baseline"]].tolist()
+        assert counts == [only.count((True, False)), only.count((False, True))]
+        is_as("position_rmse_m", *oracle.position_rmse(found, INSTANTS))
+        is_as("gospa_m", *oracle.gospa(found, INSTANTS))
+        minutes = len({(of["log"], of["run"]) for of in both})
+        is_as("false_positives_per_min", oracle.ghosts_per_min(both, "late", "ideal"), minutes)
+
+
+@settings(max_examples=8)
+@given(seeds)
+def test_intervals_resample_whole_logs(seed):
+    given_study = study(seed, 5, fewest=2)
+    with TemporaryDirectory() as scratch:
+        table = compare([write_folder(Path(scratch) / "study", **given_study)]).overall.set_index("metric")
+    found = oracle.pairs(given_study["rows"], "late", "ideal")
+    logs = sorted({pair[0]["log"] for pair in found})
+    of_metric = {
+        "detected_share": lambda drawn: oracle.share(drawn, "detected"),
+        "ttd_rmst_s": oracle.restricted_means,
+        "dad_median_m": oracle.medians,
+    }
+    for metric, figure in of_metric.items():
+        if table.loc[metric, "interval"] != "bootstrap" or table.loc[metric, "interval_over"] != "logs":
+            continue
+
+        def difference(names: list[str], figure: Any = figure) -> float:
+            return figure([pair for name in names for pair in found if pair[0]["log"] == name])[2]
+
+        if metric == "dad_median_m" and any(
+            oracle.medians([p for p in found if p[0]["log"] == n]) is None for n in logs
+        ):
+            continue
+        with np.errstate(invalid="ignore"):  # of medians that are infinite
+            limits = limits_of(logs, difference)
+        wanted = [limit if np.isfinite(limit) else np.nan for limit in limits]
+        assert table.loc[metric, ["low", "high"]].tolist() == pytest.approx(wanted, abs=1e-9, nan_ok=True)
+
+
+@settings(max_examples=15)
+@given(seeds, log_counts)
+def test_files_folders_and_orders_are_alike(seed, count):
+    """Rows of logs among each other, of small row groups, or in a file for each log."""
+    given_study, rnd = study(seed, count), Random(seed)
+    with TemporaryDirectory() as scratch:
+        folder = write_folder(Path(scratch) / "study", **given_study)
+        whole = compare([folder], false_positives_per_min=5.0)
+        order = list(range(len(given_study["rows"])))
+        rnd.shuffle(order)
+        for name in ("detections.parquet", "accuracy.parquet"):
+            table = parquet.read_table(folder / name).take(order)
+            parquet.write_table(table, folder / name, row_group_size=rnd.randint(1, 4))
+        shuffled = compare([folder], false_positives_per_min=5.0)
+        table = parquet.read_table(folder / "detections.parquet")
+        (folder / "detections.parquet").unlink()
+        (folder / "detections.parquet").mkdir()
+        for log in table["log"].unique().to_pylist():
+            mine = table.filter(compute.equal(table["log"], log))
+            parquet.write_table(mine, file_of(folder / "detections.parquet", log))
+        apart = compare([folder], false_positives_per_min=5.0)
+    for other in (shuffled, apart):
+        pd.testing.assert_frame_equal(other.table, whole.table, check_exact=True)
+        assert other.notes == whole.notes
+
+
+@settings(max_examples=15)
+@given(seeds)
+def test_runs_told_as_logs_give_the_same_over_all(seed):
+    """What one log says in several runs several logs say in one run each."""
+    given_study = study(seed, 1)
+    rows = given_study["rows"]
+    runs = sorted({of["run"] for of in rows})
+    logs = {name: f"content of {name}" for name in (f"run {run}" for run in runs)}
+    apart = (
+        given_study
+        | {"logs": logs}
+        | {
+            name: [of | {"log": f"run {of['run']}", "run": 0} for of in given_study[name]]
+            for name in ("rows", "lists", "steps")
+        }
+    )
+    with TemporaryDirectory() as scratch:
+        one, several = (
+            compare([write_folder(Path(scratch) / name, **of)], false_positives_per_min=5.0).overall
+            for name, of in (("one", given_study), ("several", apart))
+        )
+    columns = [name for name in one.columns if not name.startswith(("interval", "low", "high"))]
+    pd.testing.assert_frame_equal(
+        one[columns].reset_index(drop=True), several[columns].reset_index(drop=True), rtol=1e-12
+    )
