@@ -6,8 +6,8 @@ A modelled unit sends a list when it is ready, a recorded one when it was record
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Hashable, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -23,16 +23,40 @@ LINKS = {"radio": "copem_replay.communication.radio:Radio"}
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
+class KeptDraws:
+    """What links drew for the lists of one log, run by run: several configurations send by a link, and what is said of
+    links goes by it once more. When there is no more room for it all is forgotten; it would only be drawn again.
+    """
+
+    def __init__(self, room_bytes: int = 64_000_000) -> None:
+        self._room_bytes, self._held_bytes = room_bytes, 0
+        self._kept: dict[Hashable, list[tuple[LinkModel, tuple[Float, Bool]]]] = {}
+
+    def of(self, link: LinkModel, lists: Hashable, drawn: Callable[[], tuple[Float, Bool]]) -> tuple[Float, Bool]:
+        """What a link drew for some lists of one run: `drawn`, if it was not before."""
+        for other, found in tuple(self._kept.get(lists, ())):
+            if other == link:
+                return found
+        made = drawn()
+        size = sum(column.nbytes for column in made)
+        if self._held_bytes + size > self._room_bytes:
+            self._kept, self._held_bytes = {}, 0
+        self._kept.setdefault(lists, []).append((link, made))
+        self._held_bytes += size
+        return made
+
+
 @dataclass(frozen=True)
 class Air:
     """What else a link may go by, of lists (F,) in one run: their numbers, their ways, and how many objects each has.
 
-    `path`, `objects`: None where no link of the experiment asks for them.
+    `path`, `objects`: None where no link of the experiment asks for them. `kept`: what was drawn for these lists.
     """
 
     draws: Draws
     path: RadioPath | None
     objects: Int | None
+    kept: KeptDraws = field(default_factory=KeptDraws)
 
 
 @dataclass(frozen=True)
@@ -150,7 +174,7 @@ def transmit(
         arrives_s = np.where(_of_units(seen, heard), arrives_s, np.inf)
     if issue_hz is not None:
         arrives_s = ticks_s(arrives_s, issue_hz)
-    return replace(seen, arrives_s=arrives_s[None])
+    return seen.with_values(arrives_s=arrives_s[None])
 
 
 def ticks_s(time_s: Float, rate_hz: float) -> Float:

@@ -80,19 +80,28 @@ class Radio(LinkModel):
 
     def delays_s(self, lists: SentLists) -> Float:
         """(1, F) in the run that the lists are of."""
-        waits_s = self._waits_s(lists)
-        fixed_s, air = self.latency.fixed_s, lists.air
-        if fixed_s is not None:
-            delay_s = waits_s + fixed_s
+        waits_s, air = self._waits_s(lists), lists.air
+        if air is None:
+            latency_s, arrives = self._drawn(lists)
         else:
-            uniform = _numbers(air, "latency", self.memory.get("latency", ()))
-            delay_s = waits_s + delays_of(self.latency, uniform, f"{lists.where}.latency")
+            whose = air.draws.rng, lists.units, air.draws.runs.tobytes()
+            latency_s, arrives = air.kept.of(self, whose, lambda: self._drawn(lists))
+        delay_s = waits_s + latency_s
         if self.order == "kept":
             delay_s = _in_order(lists, delay_s)
+        return np.where(arrives, delay_s, np.inf)[None]
+
+    def _drawn(self, lists: SentLists) -> tuple[Float, Bool]:
+        """(F,) the latency of each list, and whether it arrives: nothing of it depends on what is in the lists."""
+        air, fixed_s = lists.air, self.latency.fixed_s
+        latency_s, arrives = np.full(len(lists.sent_s), fixed_s or 0.0), np.ones(len(lists.sent_s), dtype=bool)
+        if fixed_s is None:
+            uniform = _numbers(air, "latency", self.memory.get("latency", ()))
+            latency_s = delays_of(self.latency, uniform, f"{lists.where}.latency")
         if self.loses:
             uniform = _numbers(air, "reception", self.memory.get("reception", ()))
-            delay_s = np.where(uniform < self.received(lists), delay_s, np.inf)
-        return delay_s[None]
+            arrives = uniform < self.received(lists)
+        return latency_s, arrives
 
     def received(self, lists: SentLists) -> Float:
         """(F,) the probability that each list arrives."""

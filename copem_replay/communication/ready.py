@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -30,4 +29,4 @@ def when_ready(seen: Tracks, ready: Mapping[str, LatencyModel], rng: CounterRng,
         random_key = shared(RandomKey((name,), of_unit, of_unit.astype(np.uint64), seen.stamp_ns[mine]), "unit")
         [uniform] = rng.uniform("ready", random_key, runs)
         arrives_s[mine] += delays_of(model, uniform, f"units.{name}.ready")
-    return replace(seen, arrives_s=arrives_s[None])
+    return seen.with_values(arrives_s=arrives_s[None])

@@ -201,6 +201,21 @@ class Tracks:
         """(P,) rows list by list, in each from west to east, and at one place the first object first; of one run."""
         return np.lexsort((self.row_object_ix, self.x_m[0], self.frame_ix))
 
+    def with_values(self, **columns: Any) -> Tracks:
+        """The same rows of the same lists with other arrivals or values: what is known of the rows is kept."""
+        result = replace(self, **columns)
+        vars(result).update({name: vars(self)[name] for name in _OF_ROWS if name in vars(self)})
+        return result
+
+    def take_run(self, s: int) -> Tracks:
+        """One run of (S,), a view of its arrivals and values."""
+        if len(self.valid) == 1:
+            return self
+        for name in _OF_ROWS:  # once for all runs
+            getattr(self, name)
+        columns = {n: a[s : s + 1] for n in _BY_RUN if (a := getattr(self, n)) is not None and len(a) > 1}
+        return self.with_values(**columns)
+
     def take_tracks(self, keep: Bool) -> Tracks:
         """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(keep[self.track_ix]))
@@ -305,3 +320,6 @@ def spliced(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Tracks, I
 
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
 UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)
+_BY_RUN = ("arrives_s", "valid", *VALUES, *UNCERTAINTIES)
+_OF_ROWS = ("track_ix", "row_object_ix", "row_unit_ix", "row_captured_s", "by_frame")
+"""Properties that depend on neither arrivals nor values."""

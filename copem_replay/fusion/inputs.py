@@ -30,19 +30,26 @@ class Claims:
 
 def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
     """The lists of all units in all runs, F in each of S. `drawn (S, P)`: by what entries of a list are ordered."""
-    start, picked = listed_rows(heard, drawn, without_object_ix=without_object_ix)
-    covariances = dict(zip(COVARIANCES, floored(heard), strict=True))
-    template = _template(heard, claims, covariances)
-    entries = taken(template, picked)
-    run = np.repeat(np.arange(len(start)), start[:, -1] - start[:, 0])
-    for name in VALUES:
-        values = getattr(heard, name)
-        if len(values) > 1:
-            entries[name] = values[run, picked]
-    for name, values in covariances.items():
-        if len(values) > 1:
-            entries[name] = values[run, picked]
-    return ObjectLists(start, entries)
+    return RowEntries(heard, claims).lists(heard, drawn, without_object_ix=without_object_ix)
+
+
+class RowEntries:
+    """Rows (P,) of lists in the runs (S,) as entries: what of them is the same in all runs is made once."""
+
+    def __init__(self, seen: Tracks, claims: Claims) -> None:
+        self._columns = {name: getattr(seen, name) for name in VALUES}
+        self._columns |= zip(COVARIANCES, floored(seen), strict=True)
+        self._template = _template(seen, claims, self._columns)
+
+    def lists(self, seen: Tracks, drawn: Float, s: int | None = None, *, without_object_ix: int) -> ObjectLists:
+        """The lists of all runs, or of run s alone: `seen` and `drawn` are of that, too."""
+        start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
+        entries = taken(self._template, picked)
+        run = np.repeat(np.arange(len(start)) if s is None else s, start[:, -1] - start[:, 0])
+        for name, values in self._columns.items():
+            if len(values) > 1:
+                entries[name] = values[run, picked]
+        return ObjectLists(start, entries)
 
 
 def listed_rows(heard: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
@@ -90,13 +97,10 @@ def with_kept(told: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) 
     )
 
 
-def _template(heard: Tracks, claims: Claims, covariances: Mapping[str, Float]) -> Entries:
+def _template(heard: Tracks, claims: Claims, columns: Mapping[str, Float]) -> Entries:
     """(P,) all that is the same in all runs."""
     entries = np.zeros(len(heard.frame_ix), dtype=ENTRY)
-    for name in VALUES:
-        if len(values := getattr(heard, name)) == 1:
-            entries[name] = values[0]
-    for name, values in covariances.items():
+    for name, values in columns.items():
         if len(values) == 1:
             entries[name] = values[0]
     entries["existence"], entries["class_probability"] = claims.existence, claims.class_probability

@@ -54,8 +54,8 @@ def table(
     meeting: Sequence[Encounter],
     runs: Int,
     events: Mapping[str, Events],
-) -> pd.DataFrame:
-    """The rows of `detections.parquet` of one log and block of runs, by configuration, run and object."""
+) -> dict[str, Any]:
+    """The columns of `detections.parquet` of one log and block of runs, by configuration, run and object."""
     delay_s = _delays(scene, experiment, found, runs)
     parts = []
     for name, known in events.items():
@@ -63,9 +63,18 @@ def table(
         if delay_s is not None:
             columns |= _braking(experiment, found, meeting, delay_s, known)
         parts.append(columns)
-    # One table of all, not a table of each: making them is what takes longest.
-    rows: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    if delay_s is not None:
+    return beneath(parts)
+
+
+def beneath(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Columns one after the other. One table is made of all, not one of each: that is what takes longest."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def frame(columns: Mapping[str, Any]) -> pd.DataFrame:
+    """The rows of columns; `braking_pass` is null where nothing is in conflict."""
+    rows = dict(columns)
+    if "braking_pass" in rows:
         rows["braking_pass"] = pd.arrays.BooleanArray(rows["braking_pass"], ~rows["conflict"])
     return pd.DataFrame(rows)
 

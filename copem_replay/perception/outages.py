@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,7 @@ def without_outages(scene: Scene, seen: Tracks, setup: PerceptionSetup, runs: In
         return seen
     [missing] = down
     arrives_s = np.where(missing, np.inf, seen.arrives_s)
-    return replace(seen, arrives_s=arrives_s, valid=seen.valid & ~missing[seen.frame_ix])
+    return seen.with_values(arrives_s=arrives_s, valid=seen.valid & ~missing[seen.frame_ix])
 
 
 def lists_not_made(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Bool | None:

@@ -6,7 +6,6 @@ Detection is decided first, then the error is sampled, as in the paper.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -47,7 +46,7 @@ def perceive(
     valid = _listed(found, experiment, draws)
     if equipped is not None:
         valid &= equipped[:, tracks.row_unit_ix]
-    seen = replace(tracks, valid=valid)
+    seen = tracks.with_values(valid=valid)
     if states == "true":
         return seen
     return with_states(scene, seen, found, experiment, None if states == "expected" else draws)
@@ -153,4 +152,4 @@ def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup,
                 per_run("vx_mps")[:, rows] += errors.speed_mps * east
                 per_run("vy_mps")[:, rows] += errors.speed_mps * north
                 spread["speed_var_m2ps2"][0, rows] = errors.speed_var_m2ps2
-    return replace(seen, **columns, **spread)
+    return seen.with_values(**columns, **spread)

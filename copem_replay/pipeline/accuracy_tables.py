@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, joined
+from copem_replay.metrics.detections_table import beneath, frame
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.blocks import Outcome
@@ -29,13 +30,11 @@ if TYPE_CHECKING:
     from copem_replay.pipeline.scoring import Scores
 
 
-def with_accuracy(outcome: Outcome) -> pd.DataFrame:
-    """The rows of `detections` with the figures of each."""
-    parts = [_row_columns(one) for _, _, one in accuracies(outcome)]
-    if not parts:
-        return outcome.table
-    more = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return outcome.table.assign(**more)
+def with_accuracy(*outcomes: Outcome) -> pd.DataFrame:
+    """The rows of `detections` with the figures of each, block after block."""
+    parts = [_row_columns(one) for outcome in outcomes for _, _, one in accuracies(outcome)]
+    columns = beneath([outcome.columns for outcome in outcomes])
+    return frame(columns | (beneath(parts) if parts else {}))
 
 
 def _row_columns(accuracy: Accuracy) -> dict[str, Any]:

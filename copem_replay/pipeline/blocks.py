@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,12 +16,13 @@ from copem_replay.core.tracks import Float, Int, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.detection.by_truth_id import detect
 from copem_replay.metrics.detection.conflict import ConflictDetector
-from copem_replay.metrics.detections_table import Events, table
+from copem_replay.metrics.detections_table import Events, beneath, frame, table
 from copem_replay.metrics.line_of_sight import in_sight_s
 from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.conversions import as_fused_tracks
 from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.on_air import OnAir
+from copem_replay.pipeline.perceived import Perceived
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.presence import Presence
 from copem_replay.pipeline.receiver import ReceiverOutput, Receivers, WorldChunk, by_truth, listen, seen_by_all
@@ -41,17 +43,22 @@ WORTH_A_BLOCK = 1_000_000
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a block of runs (S,) gave: rows of `detections.parquet`, and by configuration how good the lists were.
+    """What a block of runs (S,) gave: columns of `detections.parquet`, and by configuration how good the lists were.
 
     `worked_s`, `accuracy_s`: how long it took, and how much of that `measure: {accuracy: false}` would have spared.
     """
 
     log: str
     runs: Int
-    table: pd.DataFrame
+    columns: dict[str, Any]
     all_scores: dict[str, Scores]
     worked_s: float
     accuracy_s: float
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The columns as rows."""
+        return frame(self.columns)
 
 
 def blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, int] | None = None) -> list[Int]:
@@ -86,7 +93,7 @@ def _matches(experiment: Experiment) -> bool:
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
     """Only what was known and when: the rows of `detections.parquet` of one block of runs (S,), without accuracy."""
     when = experiment.model_copy(update={"measure": experiment.measure.model_copy(update={"accuracy": False})})
-    return pd.concat([part.table for part in outcomes(replay, when, runs)], ignore_index=True)
+    return frame(beneath([part.columns for part in outcomes(replay, when, runs)]))
 
 
 def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]:
@@ -99,22 +106,29 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
         return [_block(replay, experiment, runs, presence)]
     # Which lists there are decides what is consecutive: runs with the same units go together.
     parts = list(presence.parts(runs))
-    if units.runs_apart:
-        parts = [(part[k : k + 1], alike) for part, alike in parts for k in range(len(part))]
-    return [_block(replay, experiment, *part) for part in parts]
+    if not units.runs_apart:
+        return [_block(replay, experiment, *part) for part in parts]
+    apart = []
+    for part, alike in parts:
+        # Of a log in several chunks what is listed in many runs is too much to be held.
+        perceived = Perceived(part, alike.listing) if replay.chunks == (WHOLE,) else None
+        apart += [_block(replay, experiment, part[k : k + 1], alike, perceived) for k in range(len(part))]
+    return apart
 
 
-def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence) -> Outcome:
+def _block(
+    replay: Replay, experiment: Experiment, runs: Int, presence: Presence, perceived: Perceived | None = None
+) -> Outcome:
     """What runs (S,) give."""
     measure, began_s = experiment.measure, time.perf_counter()
     sight_s = _in_sight(replay, experiment, presence)
-    events = _by_truth_id(replay, experiment, runs, presence, sight_s)
+    events = _by_truth_id(replay, experiment, runs, presence, sight_s, perceived)
     all_scores: dict[str, Scores] = {}
     everything, accuracy_s, lists_s = _needs_all(experiment), 0.0, time.perf_counter()
     if everything or measure.conflict is not None:
         receivers = Receivers(runs, presence.sending)
         judges: dict[str, _Judge] = {}
-        for world in replay.worlds(experiment, runs, presence, measured_only=not everything):
+        for world in replay.worlds(experiment, runs, presence, measured_only=not everything, perceived=perceived):
             around = replay.truth_cache_of(world.chunk)
             for name, output in receivers.receive(world):
                 if name not in judges:
@@ -132,8 +146,8 @@ def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence
         if not _matches(experiment) and measure.conflict is None:  # for nothing else
             accuracy_s = time.perf_counter() - lists_s
     ordered = {name: events[name] for name in experiment.configurations}
-    rows = table(replay.scene, replay.truth, experiment, replay.episodes, replay.encounters, runs, ordered)
-    return Outcome(replay.scene.log, runs, rows, all_scores, time.perf_counter() - began_s, accuracy_s)
+    columns = table(replay.scene, replay.truth, experiment, replay.episodes, replay.encounters, runs, ordered)
+    return Outcome(replay.scene.log, runs, columns, all_scores, time.perf_counter() - began_s, accuracy_s)
 
 
 class _Judge:
@@ -191,16 +205,21 @@ def _in_sight(replay: Replay, experiment: Experiment, presence: Presence) -> dic
 
 
 def _by_truth_id(
-    replay: Replay, experiment: Experiment, runs: Int, presence: Presence, sight_s: dict[str, Float]
+    replay: Replay,
+    experiment: Experiment,
+    runs: Int,
+    presence: Presence,
+    sight_s: dict[str, Float],
+    perceived: Perceived | None = None,
 ) -> dict[str, Events]:
     """Detections of the configurations that have truth ids: they need no states, only who was listed."""
     units = replay.expanded.with_(experiment)
     chosen = {name: c for name, c in units.configurations.items() if by_truth(c)}
     if not chosen:
         return {}
-    on_air = replay.on_air(experiment, runs, presence.listing)
+    on_air = replay.on_air(experiment, runs, presence.listing, perceived)
     lists = WorldChunk(replay.scene, replay.truth, replay.measured, replay.recorded, units, on_air=on_air)
-    seen = _sightings(replay, units, runs, presence, on_air)
+    seen = _sightings(replay, units, runs, presence, on_air, perceived)
     events: dict[str, Events] = {}
     for name, configuration in chosen.items():
         heard = listen(seen, lists, name, presence.sending)
@@ -217,7 +236,12 @@ def _by_truth_id(
 
 
 def _sightings(
-    replay: Replay, experiment: ExpandedExperiment, runs: Int, presence: Presence, on_air: OnAir | None
+    replay: Replay,
+    experiment: ExpandedExperiment,
+    runs: Int,
+    presence: Presence,
+    on_air: OnAir | None,
+    perceived: Perceived | None,
 ) -> Tracks:
     """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
     pieces = []
@@ -227,7 +251,9 @@ def _sightings(
         recorded = None
         if replay.recorded is not None:
             recorded = replay.recorded.captured_between(chunk.from_s, chunk.until_s)
-        world = WorldChunk(replay.scene, replay.truth, found, recorded, experiment, chunk, on_air=on_air)
+        world = WorldChunk(
+            replay.scene, replay.truth, found, recorded, experiment, chunk, on_air=on_air, perceived=perceived
+        )
         seen = seen_by_all(world, runs, states="true", equipped=presence.listing)
         if chunk == WHOLE:
             return seen

@@ -11,6 +11,7 @@ A stack's recorded output is a recorded unit that its configuration alone hears,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -130,9 +131,13 @@ class ExpandedExperiment:
 
     def links_of(self, name: str) -> list[UnitLinks]:
         """The links of one of these configurations."""
-        return self._expanded.links_of(name)
+        return self._links[name]
 
-    @property
+    @cached_property
+    def _links(self) -> dict[str, list[UnitLinks]]:
+        return {name: self._expanded.links_of(name) for name in self.configurations}
+
+    @cached_property
     def arrivals_differ(self) -> bool:
         """Whether lists arrive otherwise from run to run: each run then has lists, and instants, of its own."""
         return (

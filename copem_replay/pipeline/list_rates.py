@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from copem_replay.communication.arrivals import fusion_schedule
-from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Float, Int
+from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Float, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.link_times import LinkTimes, link_times
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
@@ -48,10 +48,14 @@ def list_times(replay: Replay, experiment: Experiment) -> dict[str, ListTimes]:
     Units that only some runs have are taken to be there.
     """
     world = replay.lists_only(experiment)
-    result: dict[str, list[ListTimes]] = {}
-    for run in range(experiment.runs if world.experiment.arrivals_differ else 1):
+    units, result, seen = world.experiment, dict[str, list[ListTimes]](), None
+    differ = units.outages or units.sends or any(ready.fixed_s is None for ready in units.ready.values())
+    for run in range(experiment.runs if units.arrivals_differ else 1):
         alone = np.array([run])
-        _add(result, replace(world, on_air=replay.on_air(experiment, alone)), alone)
+        in_run = replace(world, on_air=replay.on_air(experiment, alone))
+        if seen is None or differ:
+            seen = seen_by_all(in_run, alone, states="true")
+        _add(result, in_run, seen)
     return {name: together(runs) for name, runs in result.items()}
 
 
@@ -63,9 +67,9 @@ def together(times: Iterable[ListTimes]) -> ListTimes:
     return ListTimes(sum(one.intervals for one in every), sum(one.covered_s for one in every), added)
 
 
-def _add(result: dict[str, list[ListTimes]], world: WorldChunk, run: Int) -> None:
-    """The configurations in one run (1,)."""
-    seen, end_s = seen_by_all(world, run, states="true"), world.scene.end_s
+def _add(result: dict[str, list[ListTimes]], world: WorldChunk, seen: Tracks) -> None:
+    """The configurations in one run, with the lists `seen` in it."""
+    end_s = world.scene.end_s
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world, name)
         issue_s: Float = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s

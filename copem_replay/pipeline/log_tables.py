@@ -69,7 +69,7 @@ class LogTables:
 
 def log_tables(log: str, outcomes: Sequence[Outcome], names: Sequence[str], *, accuracy: bool) -> LogTables:
     """The tables of blocks of runs of one log, which may be scattered over them, in configurations of these `names`."""
-    rows = pd.concat([with_accuracy(outcome) for outcome in outcomes], ignore_index=True)
+    rows = with_accuracy(*outcomes)
     number = rows["configuration"].map({name: k for k, name in enumerate(names)}).to_numpy()
     order = np.lexsort((rows["run"].to_numpy(), number))
     totals = {}

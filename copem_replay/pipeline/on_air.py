@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.communication.link import Air
+from copem_replay.communication.link import Air, KeptDraws
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.draws import Draws
@@ -26,13 +26,15 @@ if TYPE_CHECKING:
 class OnAir:
     """Of the lists (F,) of all units in one run: the way of each to the ego, and how many objects it has.
 
-    None where no link asks for it. `sent`: what of them units send; None: every unit sends what it lists.
+    None where no link asks for it. `sent`: what of them units send; None: every unit sends what it lists. `kept`: what
+    links drew for lists of this log.
     """
 
     run: int
     path: RadioPath | None
     objects: Int | None
     sent: SentObjects | None = None
+    kept: KeptDraws = field(default_factory=KeptDraws)
 
     def of(self, lists: Tracks, scene: Scene, seed: int) -> Air:
         """What links of these lists go by; of the truth's there is no way, and no size."""
@@ -43,7 +45,7 @@ class OnAir:
         random_key = RandomKey(lists.units, lists.frame_unit_ix, np.full(F, word, dtype=np.uint64), lists.stamp_ns)
         times = ListTimes(lists.stamp_ns, lists.frame_unit_ix, np.arange(F))
         draws = Draws(CounterRng(seed, scene.log), random_key, times, np.array([self.run]))
-        return Air(draws, self.path if units else None, self.objects if units else None)
+        return Air(draws, self.path if units else None, self.objects if units else None, self.kept)
 
 
 def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from copem_replay.communication.link import KeptDraws
 from copem_replay.communication.reception import RadioPath
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.interpolation import at_instants
@@ -27,6 +28,7 @@ from copem_replay.perception.sensor_poses import SensorPoses, place
 from copem_replay.pipeline.chunking import Reach, time_chunks
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand
 from copem_replay.pipeline.on_air import OnAir, asks_for_path, has_channel, paths
+from copem_replay.pipeline.perceived import Perceived
 from copem_replay.pipeline.presence import Presence
 from copem_replay.pipeline.receiver import WorldChunk, ghosts_of, listen, seen_by_all
 from copem_replay.pipeline.scoring import TruthCache
@@ -131,15 +133,22 @@ class Replay:
         return WorldChunk(self.scene, self.truth, self._whole.listable, self.recorded, units, placed=self.placed)
 
     def worlds(
-        self, experiment: Experiment, runs: Int, presence: Presence, *, measured_only: bool = False
+        self,
+        experiment: Experiment,
+        runs: Int,
+        presence: Presence,
+        *,
+        measured_only: bool = False,
+        perceived: Perceived | None = None,
     ) -> Iterator[WorldChunk]:
         """The same chunk by chunk, all of it or what is looked at, for runs (S,) that have the same lists.
 
-        `presence`: which units there are.
+        `presence`: which units there are; `perceived`: of a log in one chunk what they list in these and other runs.
         """
         sending, equipped = presence.sending, presence.listing
         if self.chunks == (WHOLE,):
-            whole = replace(self.world(experiment), on_air=self.on_air(experiment, runs, equipped))
+            on_air = self.on_air(experiment, runs, equipped, perceived)
+            whole = replace(self.world(experiment), on_air=on_air, perceived=perceived)
             yield replace(whole, found=self.measured.listable) if measured_only else whole
             return
         lists = self.lists_only(experiment, runs[:1], equipped)
@@ -173,35 +182,56 @@ class Replay:
         on_air = None if runs is None else self.on_air(experiment, runs, equipped)
         return WorldChunk(self.scene, self.truth.take_rows(none), found, recorded, units, on_air=on_air)
 
-    def on_air(self, experiment: Experiment, runs: Int, equipped: Bool | None = None) -> OnAir | None:
+    def on_air(
+        self, experiment: Experiment, runs: Int, equipped: Bool | None = None, perceived: Perceived | None = None
+    ) -> OnAir | None:
         """What drawn links go by in one run (1,); None: none is drawn. `equipped (1, U)`: which units list."""
         units = self.expanded.with_(experiment)
         if not units.arrivals_differ:
             return None
+        if perceived is None:
+            return self._on_air(units, runs, equipped, None)
+        return perceived.on_air(int(runs[0]), lambda: self._on_air(units, runs, equipped, perceived))
+
+    def _on_air(
+        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, perceived: Perceived | None
+    ) -> OnAir:
         path = self.paths if asks_for_path(units, self.scene) else None
-        on_air = OnAir(int(runs[0]), path, None)
+        on_air = OnAir(int(runs[0]), path, None, kept=self._drawn)
         if units.sends:
-            on_air = replace(on_air, sent=sent_objects(units, self._listed_in(units, runs, equipped)))
-        return replace(on_air, objects=self._counts(units, runs, equipped, on_air)) if has_channel(units) else on_air
+            on_air = replace(on_air, sent=sent_objects(units, self._listed_in(units, runs, equipped, perceived)))
+        if has_channel(units):
+            on_air = replace(on_air, objects=self._counts(units, runs, equipped, on_air, perceived))
+        return on_air
+
+    @cached_property
+    def _drawn(self) -> KeptDraws:
+        return KeptDraws()
 
     def _listed_in(
-        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None
+        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, perceived: Perceived | None
     ) -> Iterator[tuple[WorldChunk, Tracks, ClaimedRows]]:
         """What the modelled units list in one run, chunk by chunk."""
         for chunk in self.chunks:
             found = self.found(chunk).listable
-            world = WorldChunk(self.scene, self.truth, found, None, units, chunk, self.placed, chunk.from_s)
+            world = WorldChunk(
+                self.scene, self.truth, found, None, units, chunk, self.placed, chunk.from_s, perceived=perceived
+            )
             ghosts = ghosts_of(world, runs)
             seen = seen_by_all(world, runs, states="sampled", equipped=equipped, ghosts=ghosts)
             yield world, seen, claimed_rows(world, runs, ghosts)
 
-    def _counts(self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, on_air: OnAir) -> Int:
+    def _counts(
+        self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, on_air: OnAir, perceived: Perceived | None
+    ) -> Int:
         """(F,) how many objects each list of one run has; ghosts are not counted."""
         counts = np.zeros(0, dtype=np.int64)
         for chunk in self.chunks:
             recorded = None if self.recorded is None else self.recorded.captured_between(chunk.from_s, chunk.until_s)
             found = self.found(chunk).listable
-            world = WorldChunk(self.scene, self.truth, found, recorded, units, chunk, on_air=on_air)
+            world = WorldChunk(
+                self.scene, self.truth, found, recorded, units, chunk, on_air=on_air, perceived=perceived
+            )
             seen = seen_by_all(world, runs, states="true", equipped=equipped)
             of_chunk = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
             counts = of_chunk + counts if len(counts) else of_chunk

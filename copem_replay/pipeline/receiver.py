@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,13 +23,14 @@ from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse, kept_by_object
-from copem_replay.fusion.inputs import Claims, inputs, listed_rows, lists_without_truth, with_kept
+from copem_replay.fusion.inputs import Claims, RowEntries, inputs, listed_rows, lists_without_truth, with_kept
 from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.outages import without_outages
-from copem_replay.perception.perceive import perceive, with_states
+from copem_replay.perception.perceive import with_states
 from copem_replay.pipeline.conversions import as_lists
 from copem_replay.pipeline.expansion import ExpandedExperiment
+from copem_replay.pipeline.perceived import Perceived, States, perceived
 from copem_replay.pipeline.sent import claimed_rows
 from copem_replay.pipeline.stated_captures import StatedCaptures, stated_captures
 
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from copem_replay.perception.sensor_poses import SensorPoses
     from copem_replay.pipeline.on_air import OnAir
 
-States = Literal["true", "expected", "sampled"]
-
 
 @dataclass(frozen=True)
 class WorldChunk:
@@ -47,7 +46,8 @@ class WorldChunk:
 
     `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
     unit per carrier. What was captured before the time chunk and is needed in it is there, too, since `earliest_s`.
-    `placed`: where the units are, for what they list of nobody. `on_air`: what drawn links go by.
+    `placed`: where the units are, for what they list of nobody. `on_air`: what drawn links go by. `perceived`: of all
+    runs of a block that go one by one, None: each run is perceived by itself.
     """
 
     scene: Scene
@@ -59,6 +59,7 @@ class WorldChunk:
     placed: SensorPoses | None = None
     earliest_s: float = -np.inf
     on_air: OnAir | None = None
+    perceived: Perceived | None = None
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,10 @@ def seen_by_all(
     So it is with `ghosts`, rows without an object: they come after those of objects, and before what is recorded.
     """
     experiment = world.experiment
-    if equipped is not None:
-        equipped = equipped[:, [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]]
-    seen = perceive(world.scene, world.found, experiment, runs, states=states, equipped=equipped)
+    if world.perceived is not None:
+        seen = world.perceived.seen(world, int(runs[0]), states)
+    else:
+        seen = perceived(world, runs, states, equipped)
     if ghosts is not None:
         drawn = ghost_draws(world.scene, ghosts, experiment, int(runs[0]))
         seen = followed_by(seen, with_states(world.scene, ghosts.found.tracks, ghosts.found, experiment, drawn))
@@ -284,7 +286,14 @@ def _without_truth(
 
     And for units whose messages are partial which entries (N,) each takes for one object.
     """
-    rows, recorded, experiment = claimed_rows(world, runs, ghosts), world.recorded, world.experiment
+    experiment, rng, ego = world.experiment, CounterRng(world.experiment.seed, world.scene.log), world.scene.ego_ix
+    none = np.empty(0, dtype=np.int64)
+    as_perceived = not (experiment.sends or experiment.outages or experiment.draws_claims)
+    if world.perceived is not None and world.recorded is None and as_perceived:
+        s, of_rows, random_key = world.perceived.entries(world, int(runs[0]), lambda every: _entries(world, every))
+        drawn = rng.uniform("order in the list", random_key, runs)
+        return of_rows.lists(seen, drawn, s, without_object_ix=ego), none
+    rows, recorded = claimed_rows(world, runs, ghosts), world.recorded
     words, same = rows.words, rows.same
     claims = Claims(rows.claims.existence, rows.claims.class_probability, rows.claims.track_id)
     if recorded is not None:
@@ -296,11 +305,17 @@ def _without_truth(
             np.concatenate([claims.track_id, recorded.track_id]),
         )
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
-    drawn = CounterRng(experiment.seed, world.scene.log).uniform("order in the list", random_key, runs)
-    ego = world.scene.ego_ix
+    drawn = rng.uniform("order in the list", random_key, runs)
     lists = lists_without_truth(seen, claims, drawn, without_object_ix=ego)
     if not experiment.partial:
-        return lists, np.empty(0, dtype=np.int64)
+        return lists, none
     picked = listed_rows(seen, drawn, without_object_ix=ego)[1]
     of = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
     return lists, np.unique(of, axis=1, return_inverse=True)[1].ravel()
+
+
+def _entries(world: WorldChunk, seen: Tracks) -> tuple[RowEntries, RandomKey]:
+    """Rows of lists of which nothing is drawn but which there are and their states; and whose they are."""
+    rows = claimed_rows(world, np.empty(0, dtype=np.int64), None)
+    claims = Claims(rows.claims.existence, rows.claims.class_probability, rows.claims.track_id)
+    return RowEntries(seen, claims), RandomKey(seen.units, seen.row_unit_ix, rows.words, seen.stamp_ns[seen.frame_ix])

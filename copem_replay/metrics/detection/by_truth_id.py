@@ -11,7 +11,7 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
@@ -51,20 +51,21 @@ def detect(
     objects out, so that a newer one takes nothing from one that it overtook; then one hit confirms.
     """
     whole = np.array([name not in partial for name in heard.units], dtype=bool)[heard.frame_unit_ix]
-    heard = replace(heard, arrives_s=np.where(whole & out_of_sequence(heard), np.inf, heard.arrives_s))
-    arrives_s = heard.common_arrives_s[heard.frame_ix]
+    heard = heard.with_values(arrives_s=np.where(whole & out_of_sequence(heard), np.inf, heard.arrives_s))
     captured_s = heard.row_captured_s
-    order, bounds = _by_object(heard, found, arrives_s)
+    order, bounds = _by_object(heard, found)
     not_before_s = np.full(len(found.object_ix), -np.inf) if count_earlier else found.onset_s - _TOLERANCE_S
     shape = (heard.valid.shape[0], len(found.object_ix))
     out = Detections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
     # From when on a list is no longer gone by: at its greatest age, within a microsecond, it still is.
-    outdated_s = np.minimum(_superseded_s(heard)[heard.frame_ix], arrives_s + max_age_s + 2 * _TOLERANCE_S)
+    arrives_s = heard.common_arrives_s
+    outdated_s = np.minimum(_superseded_s(heard), arrives_s + max_age_s + 2 * _TOLERANCE_S)[heard.frame_ix]
     # One hit confirms at once, whatever the instants.
     cluster = capture_instants(heard) if confirm.hits > 1 else np.zeros(len(heard.stamp_ns), dtype=np.int64)
     rows = _Rows(
-        heard.valid, arrives_s, captured_s, outdated_s, heard.row_unit_ix, cluster[heard.frame_ix], heard.frame_ix
-    )
+        heard.valid, arrives_s[heard.frame_ix], captured_s, outdated_s, heard.row_unit_ix, cluster[heard.frame_ix],
+        heard.frame_ix,
+    )  # fmt: skip
     stays = _Stays(order, bounds, not_before_s, found.ended_s + _TOLERANCE_S)
     found_at = _Out(out.detection_s, out.captured_s, out.first_unit_ix)
     _first(rows, heard.frame_unit_ix, stays, confirm.hits, confirm.of, found_at)
@@ -99,17 +100,24 @@ def shortest_period_s(heard: Tracks) -> float:
     return min(medians_s.tolist(), default=0.0)
 
 
-def _by_object(heard: Tracks, found: Episodes, arrives_s: Float) -> tuple[Int, Int]:
+def _by_object(heard: Tracks, found: Episodes) -> tuple[Int, Int]:
     """Rows of each episode in order of arrival, then of the units: (rows,), and where each episode's begin (M + 1,)."""
     # One place more than there are objects: index −1, no truth id, is looked at by nobody.
     episode_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
     episode_of[found.object_ix] = np.arange(len(found.object_ix))
     episode = episode_of[heard.row_object_ix]
-    rows = np.flatnonzero((episode >= 0) & np.isfinite(arrives_s))
+    arrives_s = heard.common_arrives_s
+    rows = np.flatnonzero((episode >= 0) & np.isfinite(arrives_s)[heard.frame_ix])
     # Arrivals within a microsecond are one instant: among them the experiment's order of units decides.
-    ordered = np.unique(arrives_s[rows])
-    instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > _TOLERANCE_S)[np.searchsorted(ordered, arrives_s[rows])]
-    rows = rows[np.lexsort((heard.row_unit_ix[rows], instant, episode[rows]))]
+    held = np.zeros(len(arrives_s), dtype=bool)
+    held[heard.frame_ix[rows]] = True
+    ordered = np.unique(arrives_s[held])
+    instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > _TOLERANCE_S)
+    place = np.zeros(len(arrives_s), dtype=np.int64)
+    place[held] = instant[np.searchsorted(ordered, arrives_s[held])] * len(heard.units) + heard.frame_unit_ix[held]
+    # As one number, they are nearly in order.
+    place_of_row = episode[rows] * ((len(ordered) + 1) * len(heard.units)) + place[heard.frame_ix[rows]]
+    rows = rows[np.argsort(place_of_row, kind="stable")]
     return rows, np.searchsorted(episode[rows], np.arange(len(found.object_ix) + 1))
 
 
