@@ -46,10 +46,8 @@ def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
     arrives_s = heard.common_arrives_s
     arrived = np.flatnonzero(np.isfinite(arrives_s))
     arrived = arrived[np.argsort(arrives_s[arrived], kind="stable")]
-    ordered = arrives_s[arrived]
-    # The last arrival within a microsecond of the one before belongs to the same instant.
-    last = np.append(np.diff(ordered) > _TOLERANCE_S, True) if len(ordered) else np.empty(0, dtype=bool)
-    issue_s = ordered[last]
+    last = _ends_instant(arrives_s[arrived])
+    issue_s = arrives_s[arrived][last]
     newest = np.full((len(issue_s), max(len(heard.units), 1)), -1)
     frame = arrived[~out_of_sequence(heard)[arrived]]
     instant = np.searchsorted(issue_s + _TOLERANCE_S, arrives_s[frame])
@@ -59,6 +57,18 @@ def fusion_schedule(heard: Tracks, *, max_age_s: float) -> FusionSchedule:
     outdated_s = arrives_s[newest] + max_age_s + _TOLERANCE_S
     newest[issue_s[:, None] > outdated_s] = -1
     return FusionSchedule(issue_s, newest, arrived, np.append(0, np.flatnonzero(last) + 1))
+
+
+def instants_of(heard: Tracks) -> Float:
+    """(K,) the receiver's instants alone."""
+    arrives_s = np.sort(heard.common_arrives_s[np.isfinite(heard.common_arrives_s)])
+    instants_s: Float = arrives_s[_ends_instant(arrives_s)]
+    return instants_s
+
+
+def _ends_instant(ordered_s: Float) -> Bool:
+    """(A,) which arrivals are the last of their instant; those within a microsecond of the one before belong to it."""
+    return np.append(np.diff(ordered_s) > _TOLERANCE_S, True) if len(ordered_s) else np.empty(0, dtype=bool)
 
 
 def out_of_sequence(heard: Tracks) -> Bool:

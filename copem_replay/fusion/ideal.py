@@ -17,7 +17,7 @@ from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.kept import KeptEntries, Sent, kept_entries
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import NO_CAPTURE_NS, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.covariance import FLATTEST
 
 SMALLEST_VARIANCE = 1e-9
@@ -31,10 +31,12 @@ def fuse(
     without_object_ix: int = -1,
     at: FusionSchedule | None = None,
     kept: KeptEntries | None = None,
+    weighed: Weighed | None = None,
 ) -> FusedTracks:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`. `at`: some of the instants.
 
     `kept`: what the receiver has of units whose messages are partial, of `kept_by_object`; None: there are none.
+    `weighed`: of these rows, where it is known.
 
     `heard`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
@@ -46,9 +48,10 @@ def fuse(
     )
     valid = _any(heard.valid, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
-    given = Positions(heard.x_m, heard.y_m, *floored(heard))
-    _combine_position(heard.valid, given, Information(*_information(heard)), rows, start, Positions(*out.values()))
-    spread = _combine_scalars(heard, rows, start, out)
+    weighed = weighed or Weighed.of(heard)
+    given = Positions(heard.x_m, heard.y_m, *weighed.covariances)
+    _combine_position(heard.valid, given, weighed.information, rows, start, Positions(*out.values()))
+    spread = _combine_scalars(heard, weighed, rows, start, out)
     captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
     stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], NO_CAPTURE_NS).max(axis=1)
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
@@ -119,7 +122,8 @@ def _contributions(
     object_ix = heard.row_object_ix[rows]
     keep = (object_ix != without_object_ix) & (object_ix >= 0)
     rows, instant, object_ix = rows[keep], instant[keep], object_ix[keep]
-    by = np.lexsort((heard.row_unit_ix[rows], instant, object_ix))
+    # Of an object they are in order of instants already, and of units in these; small numbers are sorted in no time.
+    by = np.argsort(object_ix.astype(np.min_scalar_type(object_ix.max(initial=0))), kind="stable")
     rows, instant, object_ix = rows[by], instant[by], object_ix[by]
     new = np.flatnonzero((np.diff(object_ix, prepend=-1) != 0) | (np.diff(instant, prepend=-1) != 0))
     return rows, np.append(new, len(rows)), object_ix[new], instant[new]
@@ -167,25 +171,46 @@ _WEIGHED_BY = {
 """The scalars that are combined, and by which variance."""
 
 
-def _combine_scalars(heard: Tracks, rows: Int, start: Int, out: dict[str, Float]) -> dict[str, Float]:
+class Weighed(NamedTuple):
+    """Of rows (P,) what is combined and how much it counts: the same whichever are listed."""
+
+    covariances: tuple[Float, Float, Float]
+    information: Information
+    scalars: Float  # (S | 1, P, V)
+    weights: Float
+
+    @classmethod
+    def of(cls, heard: Tracks) -> Weighed:
+        """Of these rows."""
+        none = np.zeros((1, len(heard.frame_ix)))
+        by = [1 / np.maximum(none if one is None else one, SMALLEST_VARIANCE) for one in _stated(heard)]
+        given = {"sin": np.sin(heard.yaw_rad), "cos": np.cos(heard.yaw_rad)}
+        values = [given[name] if name in given else getattr(heard, name) for name in _WEIGHED_BY]
+        scalars, weights = _side_by_side(values), _side_by_side([*by, none + 1])
+        return cls(floored(heard), Information(*_information(heard)), scalars, weights)
+
+    @staticmethod
+    def alike(one: Tracks, other: Tracks) -> bool:
+        """Whether it is the same of both, as all it goes by is: not a copy, but the very same."""
+        return all(getattr(one, name) is getattr(other, name) for name in (*VALUES[2:], *UNCERTAINTIES))
+
+
+def _stated(heard: Tracks) -> list[Float | None]:
+    return [getattr(heard, name) for name in _VARIANCES]
+
+
+def _combine_scalars(heard: Tracks, weighed: Weighed, rows: Int, start: Int, out: dict[str, Float]) -> dict[str, Float]:
     """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances."""
-    none = np.zeros((1, len(heard.frame_ix)))
-    stated = [getattr(heard, name) for name in _VARIANCES]
-    weights = [1 / np.maximum(none if variance is None else variance, SMALLEST_VARIANCE) for variance in stated]
-    given = {"sin": np.sin(heard.yaw_rad), "cos": np.cos(heard.yaw_rad)}
-    values = [given[name] if name in given else getattr(heard, name) for name in _WEIGHED_BY]
     shape = len(heard.valid), len(start) - 1
-    means, spreads = np.full((len(values), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
-    _scalars(
-        heard.valid, _side_by_side(values), _side_by_side([*weights, none + 1]), np.array([*_WEIGHED_BY.values()]),
-        rows, start, means, spreads,
-    )  # fmt: skip
+    means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
+    which = np.array([*_WEIGHED_BY.values()])
+    _scalars(heard.valid, weighed.scalars, weighed.weights, which, rows, start, means, spreads)
     found = dict(zip(_WEIGHED_BY, means, strict=True))
     out["yaw_rad"] = np.arctan2(found.pop("sin"), found.pop("cos"))
     out.update(found)
     return {
         name: np.where(np.isnan(spread), np.nan, 0.0) if variance is None else spread
-        for name, variance, spread in zip(_VARIANCES, stated, spreads, strict=False)
+        for name, variance, spread in zip(_VARIANCES, _stated(heard), spreads, strict=False)
     }
 
 

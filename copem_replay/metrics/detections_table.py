@@ -9,7 +9,7 @@ Source: Piazzoni et al. 2022 (distance at detection); docs/guide/metrics.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -44,6 +44,21 @@ class Events:
     detections: Detections
     in_sight_s: Float
     conflict_known_s: Float | None = None
+
+
+def stacked(runs: Sequence[Mapping[str, Events]]) -> dict[str, Events]:
+    """Events by configuration of some runs after each other."""
+    return {name: _stacked([one[name] for one in runs]) for name in runs[0]} if len(runs) > 1 else dict(runs[0])
+
+
+def _stacked(parts: Sequence[Any]) -> Any:
+    first: Any = parts[0]
+    if isinstance(first, np.ndarray):
+        return np.concatenate(parts)
+    if is_dataclass(first):
+        columns = {f.name: _stacked([getattr(part, f.name) for part in parts]) for f in fields(first)}
+        return replace(first, **columns)  # type: ignore[type-var]
+    return first
 
 
 def table(

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,7 @@ from copem_replay.core.tracks import Float, Int, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.detection.by_truth_id import detect
 from copem_replay.metrics.detection.conflict import ConflictDetector
-from copem_replay.metrics.detections_table import Events, beneath, frame, table
+from copem_replay.metrics.detections_table import Events, beneath, frame, stacked, table
 from copem_replay.metrics.line_of_sight import in_sight_s
 from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.conversions import as_fused_tracks
@@ -103,25 +103,51 @@ def outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[Outcome]
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_all(experiment)
     units = replay.expanded.with_(experiment)
     if by_entry and not units.arrivals_differ:
-        return [_block(replay, experiment, runs, presence)]
+        return _block(replay, experiment, runs, presence, apart=False)
     # Which lists there are decides what is consecutive: runs with the same units go together.
-    parts = list(presence.parts(runs))
-    if not units.runs_apart:
-        return [_block(replay, experiment, *part) for part in parts]
-    apart = []
-    for part, alike in parts:
-        # Of a log in several chunks what is listed in many runs is too much to be held.
-        perceived = Perceived(part, alike.listing) if replay.chunks == (WHOLE,) else None
-        apart += [_block(replay, experiment, part[k : k + 1], alike, perceived) for k in range(len(part))]
-    return apart
+    return [
+        outcome
+        for part in presence.parts(runs)
+        for outcome in _block(replay, experiment, *part, apart=units.runs_apart)
+    ]
 
 
-def _block(
-    replay: Replay, experiment: Experiment, runs: Int, presence: Presence, perceived: Perceived | None = None
-) -> Outcome:
-    """What runs (S,) give."""
-    measure, began_s = experiment.measure, time.perf_counter()
-    sight_s = _in_sight(replay, experiment, presence)
+def _block(replay: Replay, experiment: Experiment, runs: Int, presence: Presence, *, apart: bool) -> list[Outcome]:
+    """What runs (S,) give, at once or `apart`, one by one; what they perceive and their table are made at once."""
+    began_s, sight_s = time.perf_counter(), _in_sight(replay, experiment, presence)
+    # Of a log in several chunks what is listed in many runs is too much to be held.
+    perceived = Perceived(runs, presence.listing) if apart and replay.chunks == (WHOLE,) else None
+    pieces = np.split(runs, len(runs)) if apart else [runs]
+    known = [_known(replay, experiment, piece, presence, sight_s, perceived) for piece in pieces]
+    events = stacked([one.events for one in known])
+    columns = table(replay.scene, replay.truth, experiment, replay.episodes, replay.encounters, runs, events)
+    shape = len(events), len(pieces), -1
+    each_s = (time.perf_counter() - began_s) / len(pieces)
+    return [
+        Outcome(
+            replay.scene.log, piece, {name: column.reshape(shape)[:, k].ravel() for name, column in columns.items()},
+            known[k].all_scores, each_s, known[k].accuracy_s,
+        )
+        for k, piece in enumerate(pieces)
+    ]  # fmt: skip
+
+
+class _Known(NamedTuple):
+    events: dict[str, Events]
+    all_scores: dict[str, Scores]
+    accuracy_s: float
+
+
+def _known(
+    replay: Replay,
+    experiment: Experiment,
+    runs: Int,
+    presence: Presence,
+    sight_s: dict[str, Float],
+    perceived: Perceived | None,
+) -> _Known:
+    """What runs (S,) came to know and when, and how good their lists were."""
+    measure = experiment.measure
     events = _by_truth_id(replay, experiment, runs, presence, sight_s, perceived)
     all_scores: dict[str, Scores] = {}
     everything, accuracy_s, lists_s = _needs_all(experiment), 0.0, time.perf_counter()
@@ -145,9 +171,7 @@ def _block(
             accuracy_s += judge.accuracy_s
         if not _matches(experiment) and measure.conflict is None:  # for nothing else
             accuracy_s = time.perf_counter() - lists_s
-    ordered = {name: events[name] for name in experiment.configurations}
-    columns = table(replay.scene, replay.truth, experiment, replay.episodes, replay.encounters, runs, ordered)
-    return Outcome(replay.scene.log, runs, columns, all_scores, time.perf_counter() - began_s, accuracy_s)
+    return _Known({name: events[name] for name in experiment.configurations}, all_scores, accuracy_s)
 
 
 class _Judge:
@@ -210,7 +234,7 @@ def _by_truth_id(
     runs: Int,
     presence: Presence,
     sight_s: dict[str, Float],
-    perceived: Perceived | None = None,
+    perceived: Perceived | None,
 ) -> dict[str, Events]:
     """Detections of the configurations that have truth ids: they need no states, only who was listed."""
     units = replay.expanded.with_(experiment)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from copem_replay.communication.arrivals import fusion_schedule
-from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Float, Tracks
+from copem_replay.communication.arrivals import instants_of
+from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.link_times import LinkTimes, link_times
 from copem_replay.pipeline.receiver import WorldChunk, listen, seen_by_all
@@ -72,7 +72,7 @@ def _add(result: dict[str, list[ListTimes]], world: WorldChunk, seen: Tracks) ->
     end_s = world.scene.end_s
     for name, configuration in world.experiment.configurations.items():
         heard = listen(seen, world, name)
-        issue_s: Float = fusion_schedule(heard, max_age_s=configuration.max_age_s).issue_s
+        issue_s = instants_of(heard)
         issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= end_s + _TOLERANCE_S)]
         covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
         sending = world.experiment.units_of(configuration) or (TRUTH,)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
 from copem_replay.core.tracks import Bool, Int, Tracks
+from copem_replay.fusion.ideal import Weighed
 from copem_replay.perception.perceive import perceive
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class Perceived:
         self._runs, self._equipped = runs, equipped
         self._seen: list[tuple[Observations, States, Tracks]] = []
         self._entries: tuple[Observations, RowEntries, RandomKey] | None = None
+        self._weighed: tuple[Tracks, Weighed] | None = None
         self._on_air: tuple[int, OnAir | None] | None = None
 
     def seen(self, world: WorldChunk, run: int, states: States) -> Tracks:
@@ -46,6 +48,15 @@ class Perceived:
         if self._entries is None or self._entries[0] is not world.found:
             self._entries = world.found, *made_of(self._all(world, "sampled"))
         return self._number[run], *self._entries[1:]
+
+    def weighed(self, world: WorldChunk, states: States, heard: Tracks) -> Weighed | None:
+        """What ideal fusion goes by in all runs, if that is what it hears; None: what it hears is another in each."""
+        every = self._all(world, states)
+        if not Weighed.alike(every, heard):
+            return None
+        if self._weighed is None or self._weighed[0] is not every:
+            self._weighed = every, Weighed.of(every)
+        return self._weighed[1]
 
     def on_air(self, run: int, made: Callable[[], OnAir | None]) -> OnAir | None:
         """What drawn links go by in one of the runs, which is asked for several times before the next one."""

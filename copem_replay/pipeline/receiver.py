@@ -245,7 +245,11 @@ class Receivers:
             made_of = (of_truth, states, at.newest.tobytes(), known)
             if last is None or last[0] != made_of:
                 ego = world.scene.ego_ix
-                last = made_of, fuse(heard, max_age_s=max_age_s, without_object_ix=ego, at=at, kept=of_partial)
+                weighed = None
+                if world.perceived is not None and not of_truth:
+                    weighed = world.perceived.weighed(world, states, heard)
+                made = fuse(heard, max_age_s=max_age_s, without_object_ix=ego, at=at, kept=of_partial, weighed=weighed)
+                last = made_of, made
             fused_tracks = last[1].arriving(heard, at.issue_s)
             if not of_truth and world.recorded is None:
                 fused_tracks = replace(fused_tracks, view=world.found.view)

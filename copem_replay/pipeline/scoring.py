@@ -128,7 +128,7 @@ class Scorer:
         runs = len(output.lists.start)
         self._known = FirstMatches(
             episodes, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier,
-            captures=captures_of(output.heard),
+            captures=captures_of(output.heard, instants=measure.confirm.hits > 1),
         )  # fmt: skip
         self._aggregator = None
         if measure.accuracy:

@@ -59,12 +59,13 @@ class Captures:
     instant: Int
 
 
-def captures_of(heard: Tracks) -> Captures:
-    """The captures behind the lists that were heard."""
+def captures_of(heard: Tracks, *, instants: bool = True) -> Captures:
+    """The captures behind the lists that were heard. `instants`: whether anything goes by which are one instant."""
     came = np.isfinite(heard.common_arrives_s)
     order = np.flatnonzero(came)
     order = order[np.lexsort((heard.captured_s[order], heard.frame_unit_ix[order]))]
-    return Captures(heard.captured_s[order], heard.frame_unit_ix[order], capture_instants(heard)[order])
+    instant = capture_instants(heard)[order] if instants else np.zeros(len(order), dtype=np.int64)
+    return Captures(heard.captured_s[order], heard.frame_unit_ix[order], instant)
 
 
 class FirstMatches:
