@@ -48,7 +48,7 @@ class KeptDraws:
 
 @dataclass(frozen=True)
 class Air:
-    """What else a link may go by, of lists (F,) in one run: their numbers, their ways, and how many objects each has.
+    """What else a link may go by, of lists (F,) in one run: their numbers, their ways, and how many entries each has.
 
     `path`, `objects`: None where no link of the experiment asks for them. `kept`: what was drawn for these lists.
     """

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OnAir:
-    """Of the lists (F,) of all units in one run: the way of each to the ego, and how many objects it has.
+    """Of the lists (F,) of all units in one run: the way of each to the ego, and how many entries it has.
 
     None where no link asks for it. `sent`: what of them units send; None: every unit sends what it lists. `kept`: what
     links drew for lists of this log.

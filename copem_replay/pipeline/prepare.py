@@ -224,15 +224,15 @@ class Replay:
     def _counts(
         self, units: ExpandedExperiment, runs: Int, equipped: Bool | None, on_air: OnAir, perceived: Perceived | None
     ) -> Int:
-        """(F,) how many objects each list of one run has; ghosts are not counted."""
+        """(F,) how many entries each list of one run has, ghosts among them."""
         counts = np.zeros(0, dtype=np.int64)
         for chunk in self.chunks:
             recorded = None if self.recorded is None else self.recorded.captured_between(chunk.from_s, chunk.until_s)
             found = self.found(chunk).listable
             world = WorldChunk(
-                self.scene, self.truth, found, recorded, units, chunk, on_air=on_air, perceived=perceived
+                self.scene, self.truth, found, recorded, units, chunk, self.placed, chunk.from_s, on_air, perceived
             )
-            seen = seen_by_all(world, runs, states="true", equipped=equipped)
+            seen = seen_by_all(world, runs, states="true", equipped=equipped, ghosts=ghosts_of(world, runs))
             of_chunk = np.bincount(seen.frame_ix[seen.valid[0]], minlength=len(seen.stamp_ns))
             counts = of_chunk + counts if len(counts) else of_chunk
         return counts

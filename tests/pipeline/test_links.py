@@ -18,7 +18,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.pipeline import chunking
 from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.prepare import prepare
-from copem_replay.pipeline.receiver import listen, seen_by_all
+from copem_replay.pipeline.receiver import ghosts_of, listen, seen_by_all
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.sweep import points
 from tests.helpers import scenes
@@ -145,6 +145,21 @@ def test_a_log_in_time_chunks_gives_the_same(monkeypatch: pytest.MonkeyPatch, fl
     cut = run(some, [traffic()])
     assert len(cut.replays[0].chunks) > 2
     assert_same(whole, cut)
+
+
+def test_false_positives_are_in_the_air_too() -> None:
+    """Masts that list nothing but ghosts: of g in a list it is in the air for 8 (121 + 35 g) / 100 000 s."""
+    ghosts = {"in_list": 1.5, "lasts_s": 0.0, "where": {"kind": "field", "range_m": [3, 60]}, "classes": {"car": 1}}
+    couples = [{"detection": {"kind": "constant", "probability": 0.0}, "error": ERROR}]
+    channel = {"channel": {"kbps": 100}}
+    slow = plan("slow", pems={"half": {"couples": couples, "ghosts": [ghosts]}}, links={"slow": channel})
+    replay, runs = prepare(traffic(), slow), np.array([3])
+    found = ghosts_of(replay.world(slow), runs)
+    assert found is not None
+    heard = heard_by(slow, "gnn", one=3)
+    g = np.bincount(found.found.tracks.frame_ix, minlength=len(heard.stamp_ns))
+    assert len(np.unique(g)) > 3
+    np.testing.assert_allclose(heard.common_arrives_s - heard.captured_s, 8 * (121 + 35 * g) / 100_000, atol=1e-9)
 
 
 def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
