@@ -7,8 +7,9 @@ at the instant it was available (`metrics/matching.py`).
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -28,6 +29,23 @@ if TYPE_CHECKING:
     from copem_replay.pipeline.receiver import ReceiverOutput
 
 
+KEPT = 64
+"""Of so many sets of instants the truth is kept (chosen: where arrivals are drawn each run has its own)."""
+
+T = TypeVar("T")
+
+
+def _kept(known: dict[bytes, T], time_s: Float, made: Callable[[Float], T]) -> T:
+    """What is known of some instants, or is `made` and kept in the place of what was made first."""
+    key = time_s.tobytes()
+    found = known.get(key)
+    if found is None:
+        found = known[key] = made(time_s)
+        for oldest in list(known)[:-KEPT]:
+            known.pop(oldest, None)
+    return found
+
+
 @dataclass(frozen=True)
 class TruthCache:
     """One log's truth at the instants of fused lists. What configurations share is computed once."""
@@ -40,22 +58,21 @@ class TruthCache:
 
     def at(self, time_s: Float) -> Tracks:
         """The truth at instants (K,), ascending."""
-        key = time_s.tobytes()
-        if key not in self._worlds:
-            stamps = self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
-            gap_s = self.experiment.max_gap_s
-            near = self.truth
-            if len(time_s):
-                near = near.captured_between(time_s[0] - gap_s - AROUND_S, time_s[-1] + gap_s + AROUND_S)
-            self._worlds[key] = at_instants(near, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
-        return self._worlds[key]
+        return _kept(self._worlds, time_s, self._at)
+
+    def _at(self, time_s: Float) -> Tracks:
+        stamps = self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
+        gap_s = self.experiment.max_gap_s
+        near = self.truth
+        if len(time_s):
+            near = near.captured_between(time_s[0] - gap_s - AROUND_S, time_s[-1] + gap_s + AROUND_S)
+        return at_instants(near, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
 
     def reference(self, time_s: Float) -> Reference:
         """From where distances are measured, at instants (K,)."""
-        key = time_s.tobytes()
-        if key not in self._references:
-            self._references[key] = reference_at(self.scene, self.truth, self.experiment, time_s)
-        return self._references[key]
+        return _kept(
+            self._references, time_s, lambda time_s: reference_at(self.scene, self.truth, self.experiment, time_s)
+        )
 
     def classes(self, measure: Measure) -> Bool:
         """(C,) which classes are measured: only of these are entries that nothing true belongs to ghosts."""

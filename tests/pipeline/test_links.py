@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from copem_replay.communication.link import KeptDraws, SentLists
+from copem_replay.communication.radio import Radio
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.tracks import Tracks
 from copem_replay.experiment.file import plain as filed
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline import chunking
+from copem_replay.perception.perceive import perceive
+from copem_replay.pipeline import chunking, perceived
 from copem_replay.pipeline.blocks import outcomes
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import ghosts_of, listen, seen_by_all
@@ -130,6 +133,40 @@ def test_a_run_alone_is_the_same_run(link: str) -> None:
     for name in alone.all_scores:
         assert (alone.all_scores[name].issue_s == same.all_scores[name].issue_s).all()
     assert_same(run(some, [traffic()]), run(some, [traffic()], jobs=2))
+
+
+@pytest.mark.parametrize("link", ["v2x", None])
+def test_a_block_perceives_once(monkeypatch: pytest.MonkeyPatch, link: str | None) -> None:
+    """Which objects are listed, and with which errors: of all runs at once, whether arrivals are drawn or not."""
+    some, asked = plan(link), []
+    replay = prepare(traffic(), some)
+    outcomes(replay, some, np.arange(1))  # what is found out once a log
+
+    def counted(*given: Any, states: str, **more: Any) -> Tracks:
+        asked.append((len(given[3]), states))
+        return perceive(*given, states=states, **more)
+
+    monkeypatch.setattr(perceived, "perceive", counted)
+    outcomes(replay, some, np.arange(4))
+    # With a queue how many objects lists have goes by the rows of all objects, detection by those of measured ones.
+    assert sorted(asked) == sorted([(4, "sampled"), (4, "true"), *([(4, "true")] if link else [])])
+
+
+def test_what_a_link_drew_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For two configurations, and for what is said of links: of four runs four times. Without room more often."""
+    some, drawn = plan("v2x"), []
+
+    def counted(radio: Radio, lists: SentLists) -> Any:
+        drawn.append(lists)
+        return once(radio, lists)
+
+    once = Radio._drawn
+    monkeypatch.setattr(Radio, "_drawn", counted)
+    kept = run(some, [traffic()])
+    assert len(drawn) == 4
+    monkeypatch.setattr(KeptDraws.__init__, "__defaults__", (0,))
+    assert_same(kept, run(some, [traffic()]))
+    assert len(drawn) > 8
 
 
 @pytest.mark.parametrize("fleet", [False, True])
