@@ -6,6 +6,7 @@ Medians of nine runs of all, in turn, in seconds of the processor, of which the 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from bench_memory import interleaved
@@ -38,9 +39,7 @@ def links(recording: Recording) -> Iterator[dict[str, object]]:
             vars(replay).pop("_drawn", None)  # what links drew is of the call before
             run(experiment, [recording], ready=[replay])
 
-        constant_s, drawn_s = interleaved(
-            [lambda one=one, its=its: replayed(one, its) for one, its in zip(plans, ready, strict=True)]
-        )
+        constant_s, drawn_s = interleaved([partial(replayed, one, its) for one, its in zip(plans, ready, strict=True)])
         yield {
             "links": fusion + (" with accuracy" if accuracy else ""),
             "constant_ms_a_run": round(constant_s / RUNS * 1e3, 2),

@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.core.interpolation import states_at
@@ -22,6 +21,7 @@ from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
 from copem_replay.metrics.braking.driver import delays_of
 from copem_replay.metrics.braking.encounter import Encounter
 from copem_replay.metrics.braking.verdict import Verdicts, judge
+from copem_replay.metrics.columns import beneath
 from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.end_reason import texts_of
@@ -79,19 +79,6 @@ def table(
             columns |= _braking(experiment, found, meeting, delay_s, known)
         parts.append(columns)
     return beneath(parts)
-
-
-def beneath(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Columns one after the other. One table is made of all, not one of each: that is what takes longest."""
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def frame(columns: Mapping[str, Any]) -> pd.DataFrame:
-    """The rows of columns; `braking_pass` is null where nothing is in conflict."""
-    rows = dict(columns)
-    if "braking_pass" in rows:
-        rows["braking_pass"] = pd.arrays.BooleanArray(rows["braking_pass"], ~rows["conflict"])
-    return pd.DataFrame(rows)
 
 
 def _columns(

@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, joined
-from copem_replay.metrics.detections_table import beneath, frame
+from copem_replay.metrics.columns import beneath, frame
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.blocks import Outcome

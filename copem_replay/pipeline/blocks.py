@@ -14,9 +14,10 @@ import pandas as pd
 from copem_replay.core.time_chunk import WHOLE
 from copem_replay.core.tracks import Float, Int, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.columns import beneath, frame
 from copem_replay.metrics.detection.by_truth_id import detect
 from copem_replay.metrics.detection.conflict import ConflictDetector
-from copem_replay.metrics.detections_table import Events, beneath, frame, stacked, table
+from copem_replay.metrics.detections_table import Events, stacked, table
 from copem_replay.metrics.line_of_sight import in_sight_s
 from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.conversions import as_fused_tracks
