@@ -319,6 +319,14 @@ class Experiment(Frozen):
         added = UnitLinks(f"configurations.{name}.latency_s", ConstantLink(latency_s=configuration.latency_s))
         return [UnitLinks(w, link, None if every else frozenset(by_link[w])) for w, link in found.items()] + [added]
 
+    def has_way(self, name: str) -> bool:
+        """Whether lists of a configuration come by a link, or of a unit with `ready` or `sends`."""
+        configuration = self.configurations[name]
+        units = self.units_of(configuration)
+        if any(self.units[unit].ready is not None or self.units[unit].sends is not None for unit in units):
+            return True
+        return any(configuration.link_of(unit) is not None for unit in units or (TRUTH,))
+
     def delay_of(self, name: str, unit: str) -> float | None:
         """Seconds from capture to arrival of the lists of a unit in a configuration; None: they differ."""
         one = self.units.get(unit)

@@ -27,6 +27,7 @@ from copem_replay.metrics.detection.by_truth_id import Detections
 from copem_replay.metrics.end_reason import texts_of
 from copem_replay.metrics.episodes import Episodes
 from copem_replay.metrics.reference import Reference, reference_at
+from copem_replay.metrics.way import WAY, Way
 from copem_replay.perception.visibility import rectangles
 
 T = TypeVar("T", bound=np.generic)
@@ -37,13 +38,15 @@ class Events:
     """What one configuration came to know and when, run by run: (S, M), or (1, M) where all runs agree.
 
     `units`: names of those whose indices `detections` has. `in_sight_s`: when any of its units had the object in sight,
-    NaN: never, or not known. `conflict_known_s`: when a collision was implied, NaN: never.
+    NaN: never, or not known. `conflict_known_s`: when a collision was implied, NaN: never. `way`: None where lists have
+    neither a link nor units that take their time or choose what they send.
     """
 
     units: tuple[str, ...]
     detections: Detections
     in_sight_s: Float
     conflict_known_s: Float | None = None
+    way: Way | None = None
 
 
 def stacked(runs: Sequence[Mapping[str, Events]]) -> dict[str, Events]:
@@ -77,6 +80,10 @@ def table(
         columns = _columns(scene, truth, experiment, found, runs, name, known)
         if delay_s is not None:
             columns |= _braking(experiment, found, meeting, delay_s, known)
+        if any(of.way is not None for of in events.values()):
+            shape, none = (len(runs), len(found.object_ix)), np.full((1, 1), np.nan)
+            way = {name: none if known.way is None else getattr(known.way, name) for name in WAY}
+            columns |= {name: np.broadcast_to(values, shape).ravel() for name, values in way.items()}
         parts.append(columns)
     return beneath(parts)
 

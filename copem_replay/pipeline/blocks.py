@@ -5,20 +5,23 @@ computed anywhere, in any order, by any number of workers.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from copem_replay.communication.link import ticks_s
 from copem_replay.core.time_chunk import WHOLE
-from copem_replay.core.tracks import Float, Int, Tracks, spliced
+from copem_replay.core.tracks import TRUTH, Float, Int, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.columns import beneath, frame
-from copem_replay.metrics.detection.by_truth_id import detect
+from copem_replay.metrics.detection.by_truth_id import Detections, detect
 from copem_replay.metrics.detection.conflict import ConflictDetector
 from copem_replay.metrics.detections_table import Events, stacked, table
 from copem_replay.metrics.line_of_sight import in_sight_s
+from copem_replay.metrics.way import Way, at_list, first_listed_s, list_that_told
 from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.conversions import as_fused_tracks
 from copem_replay.pipeline.expansion import ExpandedExperiment
@@ -149,7 +152,8 @@ def _known(
 ) -> _Known:
     """What runs (S,) came to know and when, and how good their lists were."""
     measure = experiment.measure
-    events = _by_truth_id(replay, experiment, runs, presence, sight_s, perceived)
+    lists = _Lists(replay, replay.expanded.with_(experiment), runs, presence, perceived)
+    events = _by_truth_id(lists, experiment, sight_s)
     all_scores: dict[str, Scores] = {}
     everything, accuracy_s, lists_s = _needs_all(experiment), 0.0, time.perf_counter()
     if everything or measure.conflict is not None:
@@ -172,6 +176,8 @@ def _known(
             accuracy_s += judge.accuracy_s
         if not _matches(experiment) and measure.conflict is None:  # for nothing else
             accuracy_s = time.perf_counter() - lists_s
+    for name in filter(experiment.has_way, experiment.configurations):
+        events[name] = replace(events[name], way=lists.way(name, events[name].detections))
     return _Known({name: events[name] for name in experiment.configurations}, all_scores, accuracy_s)
 
 
@@ -229,32 +235,75 @@ def _in_sight(replay: Replay, experiment: Experiment, presence: Presence) -> dic
     }
 
 
-def _by_truth_id(
-    replay: Replay,
-    experiment: Experiment,
-    runs: Int,
-    presence: Presence,
-    sight_s: dict[str, Float],
-    perceived: Perceived | None,
-) -> dict[str, Events]:
+@dataclass(frozen=True)
+class _Lists:
+    """Who is listed in the runs (S,), by truth id and without states, and when these lists arrive; made when needed."""
+
+    replay: Replay
+    units: ExpandedExperiment
+    runs: Int
+    presence: Presence
+    perceived: Perceived | None
+    _arriving: dict[str, Tracks] = field(default_factory=dict)
+
+    @cached_property
+    def _world(self) -> WorldChunk:
+        replay, units = self.replay, self.units
+        on_air = replay.on_air(units.written, self.runs, self.presence.listing, self.perceived)
+        return WorldChunk(replay.scene, replay.truth, replay.measured, replay.recorded, units, on_air=on_air)
+
+    @cached_property
+    def _sent(self) -> Tracks:
+        return _sightings(self.replay, self.units, self.runs, self.presence, self._world.on_air, self.perceived)
+
+    @cached_property
+    def _listed(self) -> Tracks:
+        """The same, what units hold back with it."""
+        held_back = bool(self.units.sends)
+        return (
+            _sightings(self.replay, self.units, self.runs, self.presence, None, self.perceived)
+            if held_back
+            else self._sent
+        )
+
+    def arriving(self, name: str) -> Tracks:
+        """When the lists arrive that the receiver of a configuration hears."""
+        if name not in self._arriving:
+            self._arriving[name] = listen(self._sent, self._world, name, self.presence.sending, ticks=False)
+        return self._arriving[name]
+
+    def heard(self, name: str) -> Tracks:
+        """And when it takes them in."""
+        arriving, issue_hz = self.arriving(name), self.units.configurations[name].issue_hz
+        return arriving if issue_hz is None else replace(arriving, arrives_s=ticks_s(arriving.arrives_s, issue_hz))
+
+    def way(self, name: str, known: Detections) -> Way:
+        """Of what the receiver of a configuration knows."""
+        configuration, told = self.units.configurations[name], list_that_told(self.heard(name), known)
+        of_truth, count_earlier = configuration.units == TRUTH, self.units.measure.count_earlier
+        listed, sent = (self._world.truth,) * 2 if of_truth else (self._listed, self._sent)
+        units = self.units.units_of(configuration) or (TRUTH,)
+        return Way(
+            first_listed_s(listed, self.replay.episodes, units, count_earlier=count_earlier),
+            at_list(told, sent.common_arrives_s),
+            at_list(told, self.arriving(name).common_arrives_s),
+        )
+
+
+def _by_truth_id(lists: _Lists, experiment: Experiment, sight_s: dict[str, Float]) -> dict[str, Events]:
     """Detections of the configurations that have truth ids: they need no states, only who was listed."""
-    units = replay.expanded.with_(experiment)
-    chosen = {name: c for name, c in units.configurations.items() if by_truth(c)}
-    if not chosen:
-        return {}
-    on_air = replay.on_air(experiment, runs, presence.listing, perceived)
-    lists = WorldChunk(replay.scene, replay.truth, replay.measured, replay.recorded, units, on_air=on_air)
-    seen = _sightings(replay, units, runs, presence, on_air, perceived)
     events: dict[str, Events] = {}
-    for name, configuration in chosen.items():
-        heard = listen(seen, lists, name, presence.sending)
+    for name, configuration in lists.units.configurations.items():
+        if not by_truth(configuration):
+            continue
+        heard = lists.heard(name)
         result = detect(
             heard,
-            replay.episodes,
+            lists.replay.episodes,
             confirm=experiment.measure.confirm,
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
-            partial=units.partial,
+            partial=lists.units.partial,
         )
         events[name] = Events(heard.units, result, sight_s[name])
     return events

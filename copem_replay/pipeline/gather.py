@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.way import WAY
 from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
 from copem_replay.pipeline.closed_form import exact_table
 from copem_replay.pipeline.cost import Cost
@@ -55,7 +56,8 @@ class Gatherer:
                 whole[name] = tables
             for configuration, made_by in of_range.recipes.items():
                 assert self._pieces is not None
-                piece = self._pieces.write(made_by, tables.of(configuration))
+                way = of_range.experiment.has_way(configuration)
+                piece = self._pieces.write(made_by, tables.of(configuration, way=way))
                 found[name, configuration, of_range.runs] = piece
         return [whole[log.name] if self._pieces is None else self._joined(log, experiment, found) for log in logs]
 
@@ -149,9 +151,16 @@ def frame_of(rows: Sequence[pd.DataFrame | pa.Table]) -> pd.DataFrame:
     """Rows of several logs in one table, of the same kinds however they came to be."""
     arrow = [one for one in rows if isinstance(one, pa.Table)]
     if len(arrow) < len(rows):
-        return pd.concat(rows, ignore_index=True).infer_objects()
+        return _way_last(pd.concat(rows, ignore_index=True).infer_objects())
     table = pa.concat_tables([one.replace_schema_metadata(None) for one in arrow], promote_options="permissive")
     frame = table.to_pandas()
     if "braking_pass" in frame:
         frame["braking_pass"] = pd.array(frame["braking_pass"], dtype="boolean")
-    return frame
+    return _way_last(frame)
+
+
+def _way_last(frame: pd.DataFrame) -> pd.DataFrame:
+    """Columns that only some configurations have are in one place, however the tables came together."""
+    if not set(WAY) <= set(frame):
+        return frame
+    return frame[[*(name for name in frame if name not in WAY), *WAY]]

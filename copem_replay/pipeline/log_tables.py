@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, total
+from copem_replay.metrics.way import WAY
 from copem_replay.pipeline.accuracy_tables import accuracies, with_accuracy
 
 if TYPE_CHECKING:
@@ -53,14 +54,14 @@ class LogTables:
     runs: pa.Table | None = None
     totals: dict[str, list[tuple[int, Total]]] = field(default_factory=dict)
 
-    def of(self, configuration: str) -> LogTables:
-        """Those of one configuration."""
+    def of(self, configuration: str, *, way: bool) -> LogTables:
+        """Those of one configuration. `way`: whether it has the columns `WAY`, whatever others have."""
         assert isinstance(self.rows, pd.DataFrame)
         mine = (self.rows["configuration"] == configuration).to_numpy()
         beside, runs = self.beside, self.runs
         return LogTables(
             self.log,
-            self.rows[mine],
+            self.rows[mine] if way else self.rows[mine].drop(columns=list(WAY), errors="ignore"),
             None if beside is None else beside.filter(pa.array(mine)),
             None if runs is None else runs.filter(np.array(runs["configuration"].to_pylist()) == configuration),
             {name: nodes for name, nodes in self.totals.items() if name == configuration},

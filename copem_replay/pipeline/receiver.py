@@ -143,23 +143,27 @@ def listen(
     world: WorldChunk,
     name: str,
     there: Bool | None = None,
+    *,
+    ticks: bool = True,
 ) -> Tracks:
     """What reaches the receiver of the configuration `name`: the lists of its units, late; those of the others never.
 
     `there (U,)`: which units there are, None: all. Nothing is copied: configurations share the rows, and what was drawn
-    for them. Raises InputError where a link of the user's own fails.
+    for them. `ticks=False`: when lists arrive, not when they are taken in (`issue_hz`). Raises InputError where
+    a link of the user's own fails.
     """
     experiment, scene, on_air = world.experiment, world.scene, world.on_air
     configuration, links = experiment.configurations[name], experiment.links_of(name)
     of_truth = configuration.units == TRUTH
     lists = world.truth if of_truth else seen
     air = None if on_air is None else on_air.of(lists, scene, experiment.seed)
+    issue_hz = configuration.issue_hz if ticks else None
     if of_truth:
-        return transmit(lists, links, air=air, issue_hz=configuration.issue_hz)
+        return transmit(lists, links, air=air, issue_hz=issue_hz)
     heard = set(experiment.units_of(configuration))
     if there is not None:
         heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
-    return transmit(seen, links, heard, air=air, issue_hz=configuration.issue_hz)
+    return transmit(seen, links, heard, air=air, issue_hz=issue_hz)
 
 
 def by_truth(configuration: Configuration) -> bool:

@@ -153,4 +153,4 @@ def _compute(study: _Study, work: Work, asked: LogTask) -> None:
         tables = log_tables(log.name, made, list(work.keys), accuracy=mine.measure.accuracy)
     for name, made_by in recipes.items():
         assert log.pieces is not None
-        log.pieces.write(made_by, tables.of(name))
+        log.pieces.write(made_by, tables.of(name, way=mine.has_way(name)))
