@@ -18,6 +18,9 @@ from tests.helpers.experiments import changed, drive
 FLEET = "  mast: {on: {classes: [car], penetration_rate: 0.5}, pem: onboard}"
 EXACT = "measure: {onset: {kind: in_range, range_m: 60}, exact: true}"
 
+LINKS = "links: {v2x: {latency: 0.1, reception: {kind: constant, probability: 0.6}}}"
+RADIO = "  radio: {units: all, link: v2x}\n  last: {units: [mast]}\nmeasure:"
+
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -50,8 +53,9 @@ def replayed(text: str, out: str, kept: str | None = "kept") -> tuple[dict[str, 
         study(EXACT, "sweep: {latency_s: [0, 0.3]}"),
         study(FLEET, runs=70),
         study("measure: {onset: {kind: in_range, range_m: 60}, accuracy: false}"),
+        study(LINKS, runs=70, gnn=True).replace("measure:", RADIO),
     ],
-    ids=["fusions", "exact and swept", "fleet", "without accuracy"],
+    ids=["fusions", "exact and swept", "fleet", "without accuracy", "links"],
 )
 def test_the_same_bytes_computed_found_and_half_found(text: str, here: Path) -> None:
     plain, _, _ = replayed(text, "plain", None)
@@ -85,6 +89,17 @@ def test_what_is_added_is_computed_and_nothing_else(here: Path) -> None:
     assert replayed(study().replace("latency_s: 0.5", "latency_s: 0.4"), "out")[1:] == (6, 12)
     drive(here / "b.mcap", host=None)
     assert replayed(study("ego: '1'"), "out")[2] == 0
+
+
+def test_what_comes_by_a_link_has_columns_that_pieces_of_others_have_not(here: Path) -> None:
+    """Those of the others are the same with and without it beside them."""
+    linked = study(LINKS, runs=5).replace("measure:", RADIO)
+    beside = replayed(linked, "beside", "kept")
+    of_all = {path.name: path.read_bytes() for path in Path("kept/pieces").rglob("*.parquet")}
+    assert replayed(study(runs=5), "alone", "other")[1:] == (6, 0)
+    alone = {path.name: path.read_bytes() for path in Path("other/pieces").rglob("*.parquet")}
+    assert alone.items() <= of_all.items()
+    assert replayed(linked, "again", "other") == (beside[0], 4, 6)
 
 
 def test_a_finished_study_is_resumed_without_reading_a_log(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

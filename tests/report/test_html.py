@@ -27,7 +27,10 @@ from copem_replay.report.figures.latency_breakdown import (
     FUSION,
     HIDDEN,
     IN_SIGHT,
+    LISTED,
+    PROCESSING,
     SINCE_CAPTURED,
+    STAGES,
     TRANSPORT,
     UNTIL_CAPTURED,
     stages,
@@ -486,6 +489,20 @@ class TestWaterfall:
         assert self.stages(made, blind) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
         older = self.rows().drop(columns="in_sight_s")
         assert self.stages(made, older) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
+
+    def test_with_a_link_ready_or_sends_the_way_is_told(self, made: Path) -> None:
+        """Listed at 2.5 and 3, ready .25 and .75 s after the capture, arrived .5 s before it is known."""
+        way = self.rows(listed_s=[2.5, 3.0], sent_s=[3.25, 4.75], arrived_s=[4.5, 6.5])
+        linked = {"link": {"kind": "radio", "latency": 0.1}}
+        expected = {HIDDEN: 1.0, IN_SIGHT: 0.75, LISTED: 0.75, PROCESSING: 0.5, TRANSPORT: 1.5, FUSION: 0.5}
+        assert self.stages(made, way, **linked) == expected
+        assert list(STAGES) == [HIDDEN, IN_SIGHT, UNTIL_CAPTURED, *list(expected)[2:], SINCE_CAPTURED], "drawn in order"
+        at_once = way.assign(listed_s=[9.0, 9.0], sent_s=way["captured_s"])
+        none = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 2.0, FUSION: 0.5}
+        assert self.stages(made, at_once, **linked) == none, "stages that take no time are none"
+        blind = way.assign(in_sight_s=float("nan"))
+        rest = {stage: mean_s for stage, mean_s in expected.items() if stage not in (HIDDEN, IN_SIGHT)}
+        assert self.stages(made, blind, **linked) == {UNTIL_CAPTURED: 1.75} | rest
 
     def test_who_was_listed_while_hidden_was_hidden_until_then(self, made: Path) -> None:
         found = self.stages(made, self.rows(in_sight_s=[9.0, 2.0]))

@@ -3,17 +3,19 @@
 | stage | from | to |
 |---|---|---|
 | hidden | the onset | the first list of any of the configuration's units in which it is in sight (`in_sight_s`) |
-| in sight | there | the newest capture that contributed to knowing (`captured_s`) |
-| transport | there | the arrival of that list: captured plus latency |
+| in sight | there | the first list that has the object (`listed_s`) |
+| listed | there | the newest capture that contributed to knowing (`captured_s`) |
+| processing | there | when that list was ready to be sent (`sent_s`) |
+| transport | there | its arrival (`arrived_s`): captured plus latency where there is neither link nor `ready` |
 | fusion | there | the fused list with which it was known (`detection_s`) |
 
 Means over the rows that were detected, so that stages add up. An object listed while nobody had it in sight was hidden
 until it was listed. Of a confirmation only the newest capture is known: what it takes is spent *in sight*, as is the
-time in which another unit's list of the object is still on its way. Ideal fusion and the truth know from the list that
-brings it (one hit): all from its capture on is transport, nothing fusion. Otherwise transport is the latency, where all
-units have the same; else the two stages are one, and so they are where a link draws it. So are the first two where it
-is not known when it was in sight: the truth needs no sight, and recorded units don't tell. With `count_earlier` times
-may be negative, and nothing is drawn.
+time in which another unit's list of the object is still on its way; `listed` where lists have a way that is told
+(`metrics/way.py`). Where they have not, ideal fusion and the truth know from the list that brings it (one hit): all
+from its capture on is transport, nothing fusion. Otherwise transport is the latency, where all units have the same;
+else the two stages are one. So are the first two where it is not known when it was in sight: the truth needs no sight,
+and recorded units don't tell. With `count_earlier` times may be negative, and nothing is drawn.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import pandas as pd
 
 from copem_replay.core.tracks import TRUTH, Float
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.way import WAY
 from copem_replay.pipeline.receiver import by_truth
 from copem_replay.report.figures.captions import percent, short_names, study
 from copem_replay.report.figures.style import add_note, appearances, new_figure, of_configuration, style
@@ -36,16 +39,22 @@ if TYPE_CHECKING:
 
     from copem_replay.results.read import Results
 
-HIDDEN, IN_SIGHT, UNTIL_CAPTURED = "hidden", "in sight", "until captured"
-TRANSPORT, FUSION, SINCE_CAPTURED = "transport", "fusion", "since captured"
+HIDDEN, IN_SIGHT, UNTIL_CAPTURED, LISTED = "hidden", "in sight", "until captured", "listed"
+PROCESSING, TRANSPORT, FUSION, SINCE_CAPTURED = "processing", "transport", "fusion", "since captured"
 STAGES = {
     HIDDEN: "from the start of the clock until any of the configuration's units has it in sight in a list it makes",
     IN_SIGHT: "from there until the capture of the newest list that contributed to knowing it: out of range, missed by "
     "the perception, between two lists, not yet confirmed, or listed by a unit whose list was still on its way",
     UNTIL_CAPTURED: "from the start of the clock until that capture, where it is not known when the object was in "
     "sight: the truth needs no sight, and recorded units do not tell",
-    TRANSPORT: "the latency of that list: making the message and sending it, of which the experiment says one number",
-    FUSION: "from its arrival until the fused list with which the object was known",
+    LISTED: "where lists come by a link, or of units with ready or sends, the last part of that time: from the capture "
+    "of the first list that has the object, which was not sent, lost, overtaken, still on its way, not enough to "
+    "confirm it, or taken in together with a newer one",
+    PROCESSING: "how long the unit works on that list until it is ready to be sent",
+    TRANSPORT: "from there until it arrives: the delay of the link, queue and all, and the latency; where there is "
+    "neither link nor ready, all that the experiment says of making the message and sending it",
+    FUSION: "from its arrival until the fused list with which the object was known: confirming it, or waiting for the "
+    "next instant of issue_hz",
     SINCE_CAPTURED: "from that capture until then, where it is not known how much of it is transport: units have "
     "different latencies, or recorded ones",
 }
@@ -53,6 +62,8 @@ HATCHES = {
     HIDDEN: ("#d9d9d9", "", "#000000"),
     IN_SIGHT: ("#8c8c8c", "///", "#ffffff"),
     UNTIL_CAPTURED: ("#ffffff", "///", "#8c8c8c"),
+    LISTED: ("#d9d9d9", "\\\\\\", "#404040"),
+    PROCESSING: ("#ffffff", "|||", "#404040"),
     TRANSPORT: ("#404040", "", "#000000"),
     FUSION: ("#ffffff", "...", "#000000"),
     SINCE_CAPTURED: ("#6e6e6e", "xxx", "#ffffff"),
@@ -94,8 +105,10 @@ def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] 
         axes.set_xlim(0, 1.3 * longest_s or 1.0)
         axes.grid(visible=False, axis="y")
         axes.set_xlabel("Mean time (s)")
-        _legend(figure, [stage for stage in STAGES if any(stage in of for of in means.values())])
-        add_note(figure, [study(results, names), "Means over the rows that are detected"])
+        there = [stage for stage in STAGES if any(stage in of for of in means.values())]
+        _legend(figure, there)
+        note = [study(results, names), "Means over the rows that are detected"]
+        add_note(figure, [*note, *(["Listed: in lists that were not sent, lost or late"] if LISTED in there else [])])
     return figure
 
 
@@ -131,15 +144,25 @@ def stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, f
         return {}
     onset_s, captured_s, known_s = (rows[c].to_numpy(dtype=float) for c in ("onset_s", "captured_s", "detection_s"))
     result = {}
-    sight_s = rows["in_sight_s"].to_numpy(dtype=float) if "in_sight_s" in rows else np.full(len(rows), np.nan)
+    sight_s, listed_s, sent_s, arrived_s = (
+        rows[c].to_numpy(dtype=float) if c in rows else np.full(len(rows), np.nan) for c in ("in_sight_s", *WAY)
+    )
+    listed_s = np.fmin(listed_s, captured_s)
     if np.isnan(sight_s).all():
-        result[UNTIL_CAPTURED] = captured_s - onset_s
+        result[UNTIL_CAPTURED] = listed_s - onset_s
     else:
-        seen_s = np.fmin(sight_s, captured_s)
-        result |= {HIDDEN: seen_s - onset_s, IN_SIGHT: captured_s - seen_s}
-    result |= _since_captured(known_s - captured_s, experiment, name)
+        seen_s = np.fmin(sight_s, listed_s)
+        result |= {HIDDEN: seen_s - onset_s, IN_SIGHT: listed_s - seen_s}
+    if experiment.has_way(name):
+        arrived_s = np.fmin(arrived_s, known_s)
+        sent_s = np.fmin(sent_s, arrived_s)
+        result |= {LISTED: captured_s - listed_s, PROCESSING: sent_s - captured_s}
+        result |= {TRANSPORT: arrived_s - sent_s, FUSION: known_s - arrived_s}
+    else:
+        result |= _since_captured(known_s - captured_s, experiment, name)
     # To a nanosecond: 3.9 − 3 is not 0.9.
-    return {stage: float(np.round(values.mean(), 9)) + 0.0 for stage, values in result.items()}
+    means = {stage: float(np.round(values.mean(), 9)) + 0.0 for stage, values in result.items()}
+    return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in (LISTED, PROCESSING)}
 
 
 def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[str, Float]:
