@@ -48,6 +48,7 @@ def results(folder: Path) -> Path:
     data = _READER.load((ROOT / "logs/tc016d.yaml").read_text(encoding="utf-8")) | _CHANGES
     data["units"]["fleet"] = _FLEET
     data["measure"]["conflict"] = {"horizon_s": 3.0}
+    data["units"]["ego"]["ready"] = 0.0  # so lists have a way that is told
     cr.run(data).save(folder / "out")
     return folder / "out"
 

@@ -152,13 +152,11 @@ def transmit(
     heard: Container[str] | None = None,
     *,
     air: Air | None = None,
-    issue_hz: float | None = None,
 ) -> Tracks:
     """The same tracks with the arrival times of their lists at the receiver, inf: never.
 
     A list takes the delays of all `links` that its unit sends by, one after the other. `heard`: names of the units
-    whose lists reach the receiver, None: all. `issue_hz`: it takes them in at ticks. Raises InputError, naming where a
-    link stands, where one of the user's own fails.
+    whose lists reach the receiver, None: all. Raises InputError, naming where a link stands, where an own one fails.
     """
     arrives_s = seen.common_arrives_s
     made = np.isfinite(arrives_s)  # a list that is not made is no concern of a link
@@ -172,15 +170,14 @@ def transmit(
         made = made & np.isfinite(delay_s)
     if heard is not None:
         arrives_s = np.where(_of_units(seen, heard), arrives_s, np.inf)
-    if issue_hz is not None:
-        arrives_s = ticks_s(arrives_s, issue_hz)
     return seen.with_values(arrives_s=arrives_s[None])
 
 
-def ticks_s(time_s: Float, rate_hz: float) -> Float:
-    """The first of the instants k / rate at which each time is over, or within a microsecond."""
-    result: Float = np.ceil((time_s - _TOLERANCE_S) * rate_hz) / rate_hz
-    return result
+def taken_in(arriving: Tracks, rate_hz: float | None) -> Tracks:
+    """The same lists, each at the first of the instants k / rate at which it is there, or within a microsecond."""
+    if rate_hz is None:
+        return arriving
+    return arriving.with_values(arrives_s=np.ceil((arriving.arrives_s - _TOLERANCE_S) * rate_hz) / rate_hz)
 
 
 def _of_units(seen: Tracks, names: Container[str]) -> Bool:

@@ -15,7 +15,7 @@ from copem_replay.metrics.metric import Given, Metric
 
 @dataclass(frozen=True)
 class LinkTimes:
-    """Sums over the lists that units make: how many, lost, arrived, and overtaken by a newer one of their unit.
+    """Sums over the lists that units send: how many, lost, and overtaken by a newer one of their unit.
 
     `from_s`, `to_s (N,)`: between which ages the newest list of a unit that has arrived grew older, piece by piece.
     """
@@ -41,8 +41,11 @@ class LinkTimes:
         return float(np.interp(q * passed[-1], passed, ages[order])) if len(ages) and passed[-1] > 0 else None
 
 
-def link_times(seen: Tracks, heard: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
-    """Of lists that some units send in one run, `seen` as they are sent and `heard` as they arrive, to a log's end."""
+def link_times(seen: Tracks, arriving: Tracks, heard: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
+    """Of lists that some units send in one run, `seen` as they are sent, to a log's end.
+
+    `heard`: as the receiver takes them in; of those it takes in at once the older ones are not overtaken.
+    """
     arrives_s, late = heard.common_arrives_s, out_of_sequence(heard)
     made = np.isfinite(seen.common_arrives_s)
     made &= np.array([name in units for name in heard.units], dtype=bool)[heard.frame_unit_ix]
@@ -54,7 +57,9 @@ def link_times(seen: Tracks, heard: Tracks, units: Collection[str], end_s: float
         until_s = np.append(arrives_s[mine][1:], end_s)
         parts.append((arrives_s[mine] - heard.captured_s[mine], until_s - heard.captured_s[mine]))
     from_s, to_s = (np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (0, 1))
-    return LinkTimes(int(made.sum()), int((made & ~came).sum()), int((came & late).sum()), from_s, to_s)
+    return LinkTimes(
+        int(made.sum()), int((made & ~came).sum()), int((came & out_of_sequence(arriving)).sum()), from_s, to_s
+    )
 
 
 def _times(given: Given) -> LinkTimes | None:
@@ -73,6 +78,7 @@ LINK = (
          help="how old the newest list of a unit that has arrived by a link is, half of the time; from its capture"),
     _row("age_of_information_p95_s", value=lambda of: of.age_s(0.95), help="and 95 % of the time"),
     _row("overtaken_share", value=lambda of: _share(of.overtaken, of.sent - of.lost),
-         help="share of the lists that arrive after a newer one of their unit, and serve nothing"),
+         help="share of the lists that arrive after a newer one of their unit, of those that arrive; trackers still "
+              "hear them, and all fusions where messages are partial"),
 )  # fmt: skip
 """Columns of `summary.csv` where a configuration has a link."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from copem_replay.communication.link import ticks_s
+from copem_replay.communication.link import taken_in
 from copem_replay.core.time_chunk import WHOLE
 from copem_replay.core.tracks import TRUTH, Float, Int, Tracks, spliced
 from copem_replay.experiment.schema import Experiment
@@ -274,8 +274,7 @@ class _Lists:
 
     def heard(self, name: str) -> Tracks:
         """And when it takes them in."""
-        arriving, issue_hz = self.arriving(name), self.units.configurations[name].issue_hz
-        return arriving if issue_hz is None else replace(arriving, arrives_s=ticks_s(arriving.arrives_s, issue_hz))
+        return taken_in(self.arriving(name), self.units.configurations[name].issue_hz)
 
     def way(self, name: str, known: Detections) -> Way:
         """Of what the receiver of a configuration knows."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from copem_replay.communication.link import UnitLinks, transmit
+from copem_replay.communication.link import UnitLinks, taken_in, transmit
 from copem_replay.communication.radio import Radio
 from copem_replay.communication.ready import when_ready
 from copem_replay.communication.reception import ConstantReception, RadioPath, probability_of
@@ -45,7 +45,7 @@ def exactly_heard(replay: Replay, experiment: ExpandedExperiment, name: str, hit
             received *= share
             one = replace(one, link=one.link.model_copy(update={"reception": ConstantReception()}))
         sure.append(one)
-    return transmit(seen, sure, None if of_truth else units, issue_hz=configuration.issue_hz), received
+    return taken_in(transmit(seen, sure, None if of_truth else units), configuration.issue_hz), received
 
 
 def _check(one: UnitLinks, link: Radio, name: str, hits: int) -> None:

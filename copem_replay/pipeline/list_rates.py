@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from copem_replay.communication.arrivals import instants_of
+from copem_replay.communication.link import taken_in
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.link_times import LinkTimes, link_times
@@ -71,7 +72,8 @@ def _add(result: dict[str, list[ListTimes]], world: WorldChunk, seen: Tracks) ->
     """The configurations in one run, with the lists `seen` in it."""
     end_s = world.scene.end_s
     for name, configuration in world.experiment.configurations.items():
-        heard = listen(seen, world, name)
+        arriving = listen(seen, world, name, ticks=False)
+        heard = taken_in(arriving, configuration.issue_hz)
         issue_s = instants_of(heard)
         issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= end_s + _TOLERANCE_S)]
         covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
@@ -80,5 +82,5 @@ def _add(result: dict[str, list[ListTimes]], world: WorldChunk, seen: Tracks) ->
         links = None
         if linked:
             sent = world.truth if configuration.units == TRUTH else seen
-            links = link_times(sent, heard, linked, end_s)
+            links = link_times(sent, arriving, heard, linked, end_s)
         result.setdefault(name, []).append(ListTimes(max(len(issue_s) - 1, 0), covered_s, links))

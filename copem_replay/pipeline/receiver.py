@@ -11,7 +11,7 @@ import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.kept import Sent, kept_entries
-from copem_replay.communication.link import transmit
+from copem_replay.communication.link import taken_in, transmit
 from copem_replay.communication.ready import when_ready
 from copem_replay.core.followed import followed_by
 from copem_replay.core.fused_tracks import FusedTracks
@@ -157,13 +157,11 @@ def listen(
     of_truth = configuration.units == TRUTH
     lists = world.truth if of_truth else seen
     air = None if on_air is None else on_air.of(lists, scene, experiment.seed)
-    issue_hz = configuration.issue_hz if ticks else None
-    if of_truth:
-        return transmit(lists, links, air=air, issue_hz=issue_hz)
-    heard = set(experiment.units_of(configuration))
-    if there is not None:
+    heard = None if of_truth else set(experiment.units_of(configuration))
+    if heard is not None and there is not None:
         heard &= {name for name, present in zip(seen.units, there, strict=True) if present}
-    return transmit(seen, links, heard, air=air, issue_hz=issue_hz)
+    arriving = transmit(lists, links, heard, air=air)
+    return taken_in(arriving, configuration.issue_hz) if ticks else arriving
 
 
 def by_truth(configuration: Configuration) -> bool:

@@ -329,6 +329,27 @@ def test_lists_of_wired_units_are_none_of_the_links() -> None:
     assert overtaken / came > 0.1
 
 
+@pytest.mark.parametrize("sends", [None, {"kind": "cpm"}])
+def test_lists_that_are_taken_in_at_once_are_not_overtaken(sends: object) -> None:
+    """At 4 Hz two or three lists come in together, in order. By a drawn latency some are overtaken, ticks or not.
+
+    So do messages that leave objects out, whose entries are still of use.
+    """
+    units = {"ego": scenes.EGO_UNIT | ({} if sends is None else {"sends": sends})}
+    slow = {"latency": {"kind": "gamma", "mean_s": 0.4, "shape": 1}}
+    configurations = {
+        f"{name}{hz}": {"units": ["ego"], "link": name} | ({"issue_hz": hz} if hz else {})
+        for name in ("sure", "slow") for hz in (0, 4)
+    }  # fmt: skip
+    some = experiment(units=units, links={"sure": {"latency": 0.05}, "slow": slow}, configurations=configurations)
+    rows = run(some, [scenes.oncoming_car()]).summary.set_index("configuration")
+    shares = rows["overtaken_share"].to_dict()
+    heard = heard_by(some, "slow0", recording=scenes.oncoming_car()).common_arrives_s
+    overtaken = np.mean([(heard[k + 1 :] <= heard[k]).any() for k in range(len(heard))])
+    assert 0.3 < overtaken < 0.6
+    assert shares == {"sure0": 0.0, "sure4": 0.0, "slow0": overtaken, "slow4": overtaken}
+
+
 SWEPT = {
     "loss": ([0.0, 0.2, 0.6], {"reception": {"kind": "gilbert_elliott", "bad_share": 0.4, "bad_lasts_s": 0.5}}),
     "burst_s": ([0.0, 0.5, 3.0], {"reception": {"kind": "constant", "probability": 0.6},
