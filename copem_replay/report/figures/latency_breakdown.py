@@ -50,7 +50,7 @@ STAGES = {
     LISTED: "where lists come by a link, or of units with ready or sends, the last part of that time: from the capture "
     "of the first list that has the object, which was not sent, lost, overtaken, still on its way, not enough to "
     "confirm it, or taken in together with a newer one",
-    PROCESSING: "how long the unit works on that list until it is ready to be sent; of a recorded one, until its stamp",
+    PROCESSING: "how long the unit works on that list until it is ready to be sent, or what is recorded is stamped",
     TRANSPORT: "from there until it arrives: the delay of the link, queue and all, and the latency; where there is "
     "neither link nor ready, all that the experiment says of making the message and sending it",
     FUSION: "from its arrival until the fused list with which the object was known: confirming it, or waiting for the "
