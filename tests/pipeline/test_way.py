@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from copem_replay.pipeline.run import run
 from copem_replay.report.figures.latency_breakdown import stages
 from tests.helpers import scenes
 from tests.helpers.scenes import EGO_UNIT, experiment
+from tests.pipeline import test_recorded_output as recorded_outputs
 from tests.pipeline.test_links import BURSTS, GAMMA, plan, traffic
 
 TIMES = ("onset_s", "in_sight_s", "listed_s", "captured_s", "sent_s", "arrived_s", "detection_s")
@@ -176,6 +178,23 @@ def test_what_is_listed_and_never_arrives() -> None:
     assert found[2] == 4.0
     assert np.isnan(found[3:]).all()
     assert means == {}
+
+
+def test_recorded_lists_are_sent_when_they_are_stamped(tmp_path: Path) -> None:
+    """Of .25 s, stamped .05 s later, .1 s on its way; it is not known when the car was in sight."""
+    lists = [recorded_outputs.list_of(t, recorded_outputs.car(30)) for t in (0.3, 0.5)]
+    path = recorded_outputs.drive(tmp_path / "drive.mcap", lists, lists)
+    configurations = recorded_outputs.plan(path).as_written()["configurations"]
+    configurations["rsu"] = {"units": ["rsu"], "link": "v2x"}
+    some = recorded_outputs.plan(path, configurations=configurations, links={"v2x": {"latency": 0.1}})
+    table = recorded_outputs.replayed(some)[1].table
+    rows = table[table["object_id"] == "2"].set_index("configuration")
+    assert rows.loc["rsu", list(TIMES)].isna().tolist() == [False, True] + [False] * 5
+    times = rows.loc["rsu", [*WAY, "detection_s"]].astype(float).round(9).tolist()
+    assert times == [0.25, 0.3, 0.4, 0.4]
+    assert rows.loc["stack", list(WAY)].isna().all()
+    expected = {"until captured": 0.25, "processing": 0.05, "transport": 0.1, "fusion": 0.0}
+    assert stages(rows.loc[["rsu"]], some, "rsu") == expected
 
 
 def test_of_units_that_listed_it_together() -> None:

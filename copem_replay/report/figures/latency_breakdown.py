@@ -108,7 +108,7 @@ def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] 
         there = [stage for stage in STAGES if any(stage in of for of in means.values())]
         _legend(figure, there)
         note = [study(results, names), "Means over the rows that are detected"]
-        add_note(figure, [*note, *(["Listed: in lists that were not sent, lost or late"] if LISTED in there else [])])
+        add_note(figure, [*note, *(["Listed: not sent, lost or late"] if LISTED in there else [])])
     return figure
 
 
