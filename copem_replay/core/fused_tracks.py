@@ -50,6 +50,7 @@ class FusedTracks:
     said: Entries | None = None
     scene: Scene | None = None  # of the log, where rows are to be named
     faults: UnitFaults | None = None  # of `heard`, in one run: where a unit has outages or ghosts
+    by_link: Bool | None = None  # (F,) lists of `heard` that units send by a link, in one run; None: there is none
 
     def to_dataframe(self) -> pd.DataFrame:
         """The entries of all lists of one run, in the order of the lists.

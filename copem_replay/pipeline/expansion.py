@@ -20,7 +20,7 @@ from copem_replay.communication.link import UnitLinks
 from copem_replay.communication.sends import Sends
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.random import CounterRng, RandomKey, object_words
-from copem_replay.core.tracks import Bool, Float, Int, Scene, class_indices
+from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Scene, class_indices
 from copem_replay.experiment.schema import Configuration, Experiment, Unit, output_unit
 from copem_replay.fusion.as_recorded import AsPredicted, AsRecorded
 from copem_replay.fusion.base import ListFusion
@@ -136,6 +136,11 @@ class ExpandedExperiment:
     @cached_property
     def _links(self) -> dict[str, list[UnitLinks]]:
         return {name: self._expanded.links_of(name) for name in self.configurations}
+
+    def linked(self, name: str) -> list[str]:
+        """The units that send by a link in one of these configurations; of the truth TRUTH."""
+        configuration = self.configurations[name]
+        return [unit for unit in self.units_of(configuration) or (TRUTH,) if configuration.link_of(unit) is not None]
 
     @cached_property
     def arrivals_differ(self) -> bool:

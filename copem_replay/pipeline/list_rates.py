@@ -77,10 +77,8 @@ def _add(result: dict[str, list[ListTimes]], world: WorldChunk, seen: Tracks) ->
         issue_s = instants_of(heard)
         issue_s = issue_s[(issue_s >= -_TOLERANCE_S) & (issue_s <= end_s + _TOLERANCE_S)]
         covered_s = float(issue_s[-1] - issue_s[0]) if len(issue_s) > 1 else 0.0
-        sending = world.experiment.units_of(configuration) or (TRUTH,)
-        linked = [unit for unit in sending if configuration.link_of(unit) is not None]
         links = None
-        if linked:
+        if linked := world.experiment.linked(name):
             sent = world.truth if configuration.units == TRUTH else seen
             links = link_times(sent, arriving, heard, linked, end_s)
         result.setdefault(name, []).append(ListTimes(max(len(issue_s) - 1, 0), covered_s, links))

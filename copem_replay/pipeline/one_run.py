@@ -11,6 +11,7 @@ import numpy as np
 from copem_replay.core.errors import ExperimentError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.time_chunk import WHOLE
+from copem_replay.core.tracks import TRUTH, Bool, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.chunking import ROWS_HELD, observation_rows
 from copem_replay.pipeline.conversions import as_fused_tracks
@@ -65,7 +66,18 @@ class RunTracks:
                     result[name] = as_fused_tracks(one.lists, 0, matches, one.heard, one.at.issue_s, one.at.newest)
                 if one.faults is not None:
                     result[name] = replace(result[name], faults=one.faults)
+                if linked := world.experiment.linked(name):
+                    result[name] = replace(result[name], by_link=_by_link(one.sent, linked, presence))
             yield result
+
+
+def _by_link(sent: Tracks, linked: list[str], presence: Presence) -> Bool:
+    """(F,) which lists the units of this run send by a link."""
+    sending = np.array([name in linked for name in sent.units])
+    if sent.units != (TRUTH,):
+        sending &= presence.sending
+    there: Bool = sending[sent.frame_unit_ix] & np.isfinite(sent.common_arrives_s)
+    return there
 
 
 def tracks_of_run(replay: Replay, experiment: Experiment, run: int) -> dict[str, FusedTracks]:

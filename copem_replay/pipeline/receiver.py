@@ -69,10 +69,12 @@ class ReceiverOutput:
     `fused_tracks`: of ideal fusion and the truth, which know the objects; else None. `lists` are the same without
     truth ids, or what another fusion gave; one run where all runs agree. `tells_of`: of which instant entries tell;
     `whole`: the instants are those of the whole log, not of a time chunk. `stated`: what a fusion was told of captures,
-    in one run; None: the truth. `faults`: what of the lists is false or missing in it, where units have such.
+    in one run; None: the truth. `faults`: what of the lists is false or missing in it, where units have such. `sent`:
+    `heard` before it went by links.
     """
 
     heard: Tracks
+    sent: Tracks
     at: FusionSchedule
     fused_tracks: FusedTracks | None
     scene: Scene
@@ -209,6 +211,7 @@ class Receivers:
             max_age_s = configuration.max_age_s
             posterior = isinstance(fusion, Ideal) and fusion.combine == "posterior" and not of_truth
             states: States = "expected" if posterior else "sampled"
+            sent = world.truth if of_truth else seen_in(states)
             heard = listen(seen_in(states), world, name, self._there)
             if name not in self._schedules:
                 self._schedules[name] = fusion_schedule(heard, max_age_s=max_age_s)
@@ -237,7 +240,8 @@ class Receivers:
                     fused, self._memory[name] = resumed_by(fusion, told, self._memory.get(name), where)
                 else:  # such a log is one time chunk
                     fused = fused_by(fusion, told, where)
-                yield name, ReceiverOutput(heard, at, None, world.scene, fused, fusion.tells_of, whole, stated, faults)
+                tells_of = fusion.tells_of
+                yield name, ReceiverOutput(heard, sent, at, None, world.scene, fused, tells_of, whole, stated, faults)
                 continue
             # Later lists of the same captures, as in a sweep of latencies, are fused once.
             of_partial = None
@@ -257,7 +261,7 @@ class Receivers:
                 fused_tracks = replace(fused_tracks, view=world.found.view)
             if posterior:
                 fused_tracks = draw_posterior(fused_tracks, world.scene, experiment.seed, self._runs)
-            yield name, ReceiverOutput(heard, at, fused_tracks, world.scene, None, whole=whole, faults=faults)
+            yield name, ReceiverOutput(heard, sent, at, fused_tracks, world.scene, None, whole=whole, faults=faults)
 
 
 def ghosts_of(world: WorldChunk, runs: Int) -> GhostRows | None:

@@ -11,13 +11,14 @@
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where it was first known, and from how far away |
 | `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow |
 | `lanes/<object>/<place>_<configuration>` | how far it has come (`viewer/status.py`), a mark at the onset |
+| `lists/<place>_<configuration>/<unit>` | lists that were lost, late or overtaken, of a unit that sends by a link |
 | `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
 | `plots/visible_share/<object>/mark_1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | fused to true position: running median, and band |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/differences.py`) |
 | `legend/…` | whose colour is which |
-| `events/onsets`, `events/<configuration>`, `difference`, `summary`, `words` | in words |
+| `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | in words |
 
 `<object>` is `6_pedestrian`. Of more than six configurations there are further files (`viewer/selection.py`).
 

@@ -59,6 +59,7 @@ def blueprint(of: Content) -> tuple[rrb.Blueprint, str]:
         onset_ns,
         end_ns,
         of.baseline,
+        *([under] if any(under := [of.under(k) for k in of.objects]) else []),
     )
     return whole, digest(repr(parts))
 

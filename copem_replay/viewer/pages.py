@@ -14,6 +14,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.viewer.camera import Eye
 from copem_replay.viewer.legend import LEGEND_X, LEGEND_Y
+from copem_replay.viewer.linked_lists import UnitLists, shown_under
 from copem_replay.viewer.palette import GROUND
 from copem_replay.viewer.sink import entity_names, lanes_of, part_of, path_of, short_ids
 
@@ -26,6 +27,8 @@ NEAR_BY = 4
 """So many objects have a view that follows them: a view is some kilobytes in the file (chosen)."""
 BESIDE = 4
 """Lanes of so many objects beside each other (chosen: of six configurations all are seen at 720 points)."""
+BESIDE_LISTS = 2
+"""And of so many where lanes of lists are under them (chosen: thirteen lanes fit into the height at 720 points)."""
 MANY = 4
 """More lanes than this need half of the height (chosen)."""
 
@@ -36,6 +39,7 @@ class Content:
 
     `episodes`: the rows of the table by object; `axes_s`: from when to when each is looked at.
     `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have names.
+    `lists`: what became of those that units send by a link, by configuration, where there is one.
     """
 
     replay: Replay
@@ -49,6 +53,7 @@ class Content:
     eyes: Sequence[Eye]
     above: Eye
     named: Sequence[str]
+    lists: Mapping[str, Sequence[UnitLists]]
     baseline: str | None = None
 
     def id_of(self, object_ix: int) -> str:
@@ -58,6 +63,10 @@ class Content:
     def axis(self, object_ix: int) -> rrb.TimeAxis:
         """From half a second before its onset to half a second after it was last detected."""
         return time_axis(*self.axes_s[object_ix])
+
+    def under(self, object_ix: int) -> list[str]:
+        """Lanes of lists that are under those of an object."""
+        return [path_of(*path) for path in shown_under(self.lists, self.axes_s[object_ix])]
 
     def heard(self, configuration: str) -> tuple[str, ...]:
         """The units of a configuration."""
@@ -97,9 +106,14 @@ def who_knew_when(of: Content) -> rrb.Container:
     """Lanes of every object, each from just before its onset to just after the last detection."""
     import rerun.blueprint as rrb
 
-    groups = [of.objects[k : k + BESIDE] for k in range(0, len(of.objects), BESIDE)]
+    beside = BESIDE_LISTS if any(of.under(k) for k in of.objects) else BESIDE
+    groups = [of.objects[k : k + beside] for k in range(0, len(of.objects), beside)]
     grids = [
-        rrb.Grid(*(lanes(of, k) for k in group), grid_columns=min(len(group), 2), name=", ".join(map(of.id_of, group)))
+        rrb.Grid(
+            *(lanes(of, k, of.under(k)) for k in group),
+            grid_columns=min(len(group), 2),
+            name=", ".join(map(of.id_of, group)),
+        )
         for group in groups
     ]
     return rrb.Horizontal(
@@ -248,13 +262,14 @@ def world_view(
     )
 
 
-def lanes(of: Content, object_ix: int) -> rrb.StateTimelineView:
-    """The lanes of one object."""
+def lanes(of: Content, object_ix: int, under: Sequence[str] = ()) -> rrb.StateTimelineView:
+    """The lanes of one object, and what is under them."""
     import rerun.blueprint as rrb
 
     scene, onset_s = of.replay.scene, float(of.episodes[object_ix]["onset_s"].iloc[0])
     return rrb.StateTimelineView(
         origin=path_of(*lanes_of(scene, object_ix)),
+        contents=["+ $origin/**", *(f"+ {path}" for path in under)] if under else "$origin/**",
         name=f"{of.id_of(object_ix)}, onset {onset_s:.1f} s",
         time_view=of.axis(object_ix),
     )

@@ -36,6 +36,7 @@ from copem_replay.viewer.blueprint import aspect, blueprint
 from copem_replay.viewer.camera import eye_above, eye_after, eye_on, follow
 from copem_replay.viewer.kept import Kept
 from copem_replay.viewer.line_of_sight import Sight, sight
+from copem_replay.viewer.linked_lists import UnitLists, linked_lists, list_lanes, lists_in_words
 from copem_replay.viewer.pages import NEAR_BY, Content
 from copem_replay.viewer.selection import Part, in_parts, measured
 from copem_replay.viewer.sensors import named_units
@@ -74,12 +75,18 @@ def write_rrd(
     rest = iter(run_tracks)
     first = next(rest)
     parts = in_parts(list(first), baseline)
+    asked = experiment.configurations
     every = configuration_colours(experiment.configurations)  # by place, so the same in all files of the experiment
     told = Kept(_measured(replay, experiment, table))
     with ExitStack() as stack:
         files = []
         for part in parts:
-            content = _content(replay, experiment, table, part.configurations, told.object_ix.tolist(), baseline)
+            lists = {
+                name: linked_lists(first[name], k, name, asked[name].max_age_s)
+                for k, name in enumerate(part.configurations)
+            }
+            objects = told.object_ix.tolist()
+            content = _content(replay, experiment, table, part.configurations, objects, lists, baseline)
             panels, appearance = blueprint(content)
             what = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
@@ -125,7 +132,7 @@ def _measured(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> li
 
 def _content(
     replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: Sequence[int],
-    baseline: str | None,
+    lists: Mapping[str, Sequence[UnitLists]], baseline: str | None,
 ) -> Content:  # fmt: skip
     wide = aspect(len(configurations))
     eye = eye_on(replay, experiment, table, shown[0] if len(shown) else None, wide)
@@ -137,8 +144,9 @@ def _content(
     named = named_units(replay, experiment, eye.at_m, onset_s)
     above = eye_above(np.stack([*named.values(), eye.at_m], axis=1), eye)
     return Content(
-        replay, experiment, table, episodes, configurations, shown, axes_s, eye, eyes, above, list(named), baseline
-    )
+        replay, experiment, table, episodes, configurations, shown, axes_s, eye, eyes, above, list(named), lists,
+        baseline,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -175,7 +183,7 @@ def _begin(
     mine = of.table[of.table["configuration"].isin(list(of.configurations))]
     text_panels.differences(out, replay, mine, of.objects, further)
     text_panels.summary(out, replay, experiment, summary, run, further)
-    text_panels.legend(out)
+    text_panels.legend(out, any(of.lists.values()))
     legend.bars(out, file.colours)
     text_panels.onsets(out, scene, of.table)
     boxes.grid(out, replay.truth)
@@ -187,6 +195,8 @@ def _begin(
     for name, colour in file.colours.items():
         text_panels.events(out, scene, name, of.table[of.table["configuration"] == name])
         event_markers.detections(out, replay, experiment, of.table, name, of.objects, colour)
+        lists_in_words(out, name, of.lists[name])
+        list_lanes(out, of.lists[name])
     if len(replay.episodes.object_ix):
         curves.known(out, replay, "truth", replay.truth)
 

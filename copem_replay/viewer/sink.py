@@ -86,7 +86,12 @@ def plain(name: str) -> str:
 
 def entity_names(scene: Scene) -> list[str]:
     """(N,) what objects are called in entity paths, “6_pedestrian”; a number after those that would be the same."""
-    names = [f"{plain(name)}_{CLASSES[k]}" for name, k in zip(short_ids(scene), scene.object_class, strict=True)]
+    names = zip(short_ids(scene), scene.object_class, strict=True)
+    return distinct([f"{plain(name)}_{CLASSES[k]}" for name, k in names])
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number after those that are there twice."""
     twice = {name for name, count in Counter(names).items() if count > 1}
     return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
 

@@ -115,11 +115,12 @@ def _overview(of_each: Sequence[pd.DataFrame], scene: Scene) -> str:
     return "\n".join(lines)
 
 
-def legend(out: Out) -> None:
-    """What colours and lines mean, in words."""
+def legend(out: Out, links: bool) -> None:
+    """What colours and lines mean, in words; `links`: whether there are lanes of lists."""
     import rerun as rr
 
-    out.static(["words"], rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN))
+    text = LEGEND + LINKS if links else LEGEND
+    out.static(["words"], rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 def _cell(text: object) -> str:
@@ -150,6 +151,10 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 - lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed*, which does
   not count: before the onset, not confirmed, or too late; grey and brown: why not; the white mark ends at the onset
 - compared with a baseline: a large white dot, only the baseline holds it; a small one, the baseline does not"""
+LINKS = """
+- lanes `lists/…` under those of an object: a unit that sends by a link; from the capture of a list to that of the next,
+  if it was *lost*, *late* (longer on its way than `max_age_s`, or by an interval of its lists longer than usual) or
+  *overtaken* by a newer one, so that it served nothing; else it came in time"""
 
 
 def summary(
