@@ -1,7 +1,8 @@
 """Colours of what is no configuration's: the ground they are on, the truth, statuses, words.
 
-Lines have a contrast of 3:1 or more to the dark ground, words 4.5:1; statuses stay apart for deuteranopes. Tests
-compute both. The ground is said in every 3-D view and plot, so that a viewer in its light theme shows the same.
+Lines have a contrast of 3:1 or more to the dark ground, words 4.5:1, and 3:1 to the plate of a light theme; statuses
+stay apart for deuteranopes. Tests compute it. The ground is said in every 3-D view and plot, so that a viewer in its
+light theme shows the same.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ FIELD: Rgb = (150, 146, 118)
 """Outlines of fields of view."""
 ONSET: Rgb = (255, 255, 255)
 HIDES: Rgb = (255, 110, 95)
-"""What hides something, and words that say so."""
+"""What hides something."""
 NOTICED: Rgb = (255, 255, 255)
-WAITING: Rgb = (190, 190, 190)
-"""Of words: what is known, all else. No configuration's colour: some are too dark to be read."""
+WAITING: Rgb = (226, 226, 226)
+BEHIND: Rgb = (255, 205, 196)
+"""Of words: what is known, all else, what is hidden. No configuration's colour: some are too dark to be read. All of
+them bright: in its light theme the viewer puts them on a grey plate."""
 DIFFERENCE: Rgb = (255, 255, 255)
 """Marks of what only one of two configurations holds."""
 STATUS: dict[int, Rgb] = {
@@ -55,6 +58,6 @@ def _times(colour: Rgb, share: float) -> Rgb:
 
 
 __all__ = [
-    "DIFFERENCE", "EGO", "FIELD", "GRID", "GROUND", "HALF", "HIDES", "LANE", "NOTICED", "ONSET", "STANDING", "STATUS",
-    "TRUTH", "WAITING", "status_colour",
+    "BEHIND", "DIFFERENCE", "EGO", "FIELD", "GRID", "GROUND", "HALF", "HIDES", "LANE", "NOTICED", "ONSET", "STANDING",
+    "STATUS", "TRUTH", "WAITING", "status_colour",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Bool, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.palette import HIDES, NOTICED, WAITING
+from copem_replay.viewer.palette import BEHIND, HIDES, NOTICED, WAITING
 from copem_replay.viewer.reasons import reasons
 from copem_replay.viewer.sensors import unit_places
 from copem_replay.viewer.sink import Out, f32, ns, part_of
@@ -39,7 +39,7 @@ def words(out: Out, name: str, replay: Replay, experiment: Experiment, seen: Sig
     place[:, 2] += ABOVE_M
     colours = np.full((len(rows), 3), WAITING, dtype=np.uint8)
     at = made.status[rows, column]
-    colours[at == HIDDEN], colours[at == KNOWN] = HIDES, NOTICED
+    colours[at == HIDDEN], colours[at == KNOWN] = BEHIND, NOTICED
     started = made.elapsed_ns[rows] >= clock.onset_ns[seen.object_ix[column]]
     told = reasons(replay.scene, experiment, seen, made, rows, column, started)
     counts = np.bincount(rows, minlength=len(made.elapsed_ns))
