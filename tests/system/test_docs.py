@@ -48,7 +48,11 @@ def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
         ("README.md", [], ["copem-replay run"]),
         ("docs/tutorial.md", ["copem-replay run"], ["python tools/paper.py"]),
         ("docs/guide/links.md", ["copem-replay run"], ["python tools/links_table.py"]),
-        ("docs/guide/which-fusion.md", ["copem-replay run"] * 2, ["copem-replay compare"] * 2),
+        (
+            "docs/guide/which-fusion.md",
+            ["copem-replay run"] * 2,
+            ["copem-replay compare"] * 2 + ["python tools/combine_table.py"],
+        ),
     ],
 )
 def test_pages_show_what_their_commands_print(
