@@ -25,7 +25,7 @@ from copem_replay.metrics.way import Way, at_list, first_listed_s, list_that_tol
 from copem_replay.pipeline.chunking import ROWS_A_CHUNK
 from copem_replay.pipeline.conversions import as_fused_tracks
 from copem_replay.pipeline.expansion import ExpandedExperiment
-from copem_replay.pipeline.on_air import OnAir
+from copem_replay.pipeline.on_air import OnAir, has_channel
 from copem_replay.pipeline.perceived import Perceived
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.presence import Presence
@@ -68,11 +68,14 @@ class Outcome:
 def blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, int] | None = None) -> list[Int]:
     """The runs, or those from … up to, cut into blocks, small enough for memory and enough of them for the workers."""
     begin, end = runs or (0, experiment.runs)
-    states = _needs_all(experiment) or experiment.measure.conflict is not None
+    units = replay.expanded.with_(experiment)
+    states = _needs_all(experiment) or experiment.measure.conflict is not None or bool(units.sends)
     if len(replay.chunks) > 1:
         rows = ROWS_A_CHUNK
     else:
-        found = replay.found(WHOLE) if _needs_all(experiment) else replay.measured
+        # What is sent, and how long it is in the air, goes by all that is listed.
+        every = _needs_all(experiment) or bool(units.sends) or has_channel(units)
+        found = replay.found(WHOLE) if every else replay.measured
         rows = max(len(found.tracks.frame_ix), 1)
     even = -(-(end - begin) // jobs)
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
