@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+import bench_compare
 import bench_fit
 import bench_fusion
 import bench_links
@@ -349,8 +350,14 @@ def fit() -> Iterator[dict[str, object]]:
     yield from bench_fit.detection()
 
 
+def compare() -> Iterator[dict[str, object]]:
+    """Comparing studies of 3 and 30 logs; see bench_compare.py."""
+    yield from bench_compare.studies()
+
+
 BENCHES = (
-    pieces, visibility, memory, fit, paper, reading, writing, commands, reports, fusion, peers, links, crowd, long,
+    pieces, compare, visibility, memory, fit, paper, reading, writing, commands, reports, fusion, peers, links, crowd,
+    long,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -5,11 +5,12 @@ what is in it.
 
 | module | does |
 |---|---|
-| `folders`, `comparable`, `names` | what is read; whether it may be compared; which configurations are meant |
-| `grid`, `sides`, `lists` | rows and lists of two configurations side by side |
-| `regret`, `figures`, `intervals` | metrics of pairs, and their intervals |
+| `inputs`, `comparable`, `same_drive`, `labels` | what is read; whether it may be compared; which configurations are meant |
+| `pairing`, `configuration_data`, `per_list` | rows and lists of two configurations of a log side by side |
+| `metrics`, `differences`, `equal_ghosts` | metrics of a pair in a log |
+| `all_logs` | what is kept of a pair while its logs are gone through |
+| `bootstrap`, `limits`, `paired_statistics` | their intervals |
 | `notes`, `tables` | what is said |
-| `beside`, `merge` | one run of all of them in one recording: imported by name, as it replays |
 """
 
 from copem_replay.results.compare.compare import Comparison, compare

@@ -1,0 +1,63 @@
+"""`compare` of studies of two sizes: what ten times the logs cost in memory and time, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from copem_replay.results.contents import write_parquet
+from copem_replay.results.tables import file_of
+
+RUNS, OBJECTS, CONFIGURATIONS = 500, 20, ("ideal", "late", "later")
+_COMPARE = """
+import resource, sys, time
+from copem_replay.results.compare import compare
+began = time.perf_counter()
+compare([__import__("pathlib").Path(sys.argv[1])])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.perf_counter() - began)
+"""
+
+
+def studies() -> Iterator[dict[str, object]]:
+    """3 and 30 logs of 30,000 rows each, in a file for each log."""
+    peaks: list[float] = []
+    for logs in (3, 30):
+        with tempfile.TemporaryDirectory() as scratch:
+            write(Path(scratch), [f"log {k}" for k in range(logs)])
+            command = [sys.executable, "-c", _COMPARE, scratch]
+            peak_mb, seconds = map(float, subprocess.run(command, check=True, capture_output=True).stdout.split())
+        rows, peaks = logs * RUNS * OBJECTS * len(CONFIGURATIONS), [*peaks, peak_mb]
+        yield {"compare_rows": rows, "peak_mb": round(peak_mb), "seconds": round(seconds, 1)}
+    yield {"compare_peak_ratio": round(peaks[1] / peaks[0], 2)}
+
+
+def write(folder: Path, logs: list[str]) -> None:
+    """A results folder of so many logs, without accuracy: each object is detected at one of 50 instants, or never."""
+    said = {"format": 2, "seed": 1, "runs": RUNS, "measure": {"horizon_used_s": 10.0}, "braking": None}
+    said["logs"] = [{"log": log, "topic": None, "sha256": log} for log in logs]
+    (folder / "provenance.json").write_text(json.dumps(said))
+    (folder / "experiment.yaml").write_text("version: 1\n")
+    (folder / "detections.parquet").mkdir()
+    rng, size = np.random.default_rng(1), RUNS * OBJECTS * len(CONFIGURATIONS)
+    for log in logs:
+        instant = rng.integers(0, 60, size)
+        table = pd.DataFrame({
+            "log": log,
+            "configuration": np.repeat(CONFIGURATIONS, RUNS * OBJECTS),
+            "run": np.tile(np.repeat(np.arange(RUNS), OBJECTS), len(CONFIGURATIONS)),
+            "object_id": np.tile(np.arange(OBJECTS).astype(str), RUNS * len(CONFIGURATIONS)),
+            "onset_s": 0.0,
+            "detected": instant < 50,
+            "detection_s": np.where(instant < 50, instant / 10, np.nan),
+            "distance_at_detection_m": np.where(instant < 50, 60.0 - instant, np.nan),
+            "ended_s": 10.0,
+            "ended_by": "object_left",
+        })  # fmt: skip
+        write_parquet(table, file_of(folder / "detections.parquet", log))
