@@ -5,7 +5,7 @@ what is in it.
 
 | module | does |
 |---|---|
-| `inputs`, `comparable`, `same_drive`, `labels` | what is read; whether it may be compared; which configurations are meant |
+| `inputs`, `comparable`, `same_drive`, `labels` | what is read; may it be compared; which configurations are meant |
 | `pairing`, `configuration_data`, `per_list` | rows and lists of two configurations of a log side by side |
 | `metrics`, `differences`, `equal_ghosts` | metrics of a pair in a log |
 | `all_logs` | what is kept of a pair while its logs are gone through |
