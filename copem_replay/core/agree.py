@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, Bool, Float, Int
 
 _OTHER = CLASSES.index("other")
@@ -24,7 +25,7 @@ AGREE: Bool = _agree()
 which, and the other one of the vehicles. Symmetric, not transitive: a car and a bicycle both agree with `other`."""
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def most_probable(probability: Float) -> int:
     """Index of the largest of the probabilities `(C,)`, the first of equals; `other` where nothing is said."""
     best = 0

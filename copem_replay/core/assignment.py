@@ -22,6 +22,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from copem_replay.core.kernels import making
 from copem_replay.core.tracks import Float, Int
 
 
@@ -47,7 +48,7 @@ def assign(cost: Float, partner: Int) -> None:
     assign_pairs(row, col, pair_cost, n, m, partner)
 
 
-@nb.njit(cache=True, nogil=True)
+@making
 def assign_pairs(row: Int, col: Int, cost: Float, n: int, m: int, partner: Int) -> None:
     """Optimal assignment of the pairs `row, col, cost (P,)`, in any order; of a pair given twice the cheaper counts.
 
@@ -113,7 +114,7 @@ def _root(parent: Int, i: int) -> int:
     return i
 
 
-@nb.njit(cache=True, nogil=True)
+@making
 def _augment(start: Int, choice: Int, price: Float, n: int, m: int, partner: Int) -> None:
     """Enters row after row: the pairs of row i are `choice, price[start[i] : start[i + 1]]`; rows without are left.
 

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from copem_replay.core.tracks import Float
+from copem_replay.core.kernels import borrowing
+from copem_replay.core.tracks import Float, Int
 
 _TOUCH_M = 1e-9
 """Boxes this near touch (chosen: rounding of positions within a few kilometres of the origin)."""
@@ -36,7 +37,7 @@ def _corners_to(
     return best, apart
 
 
-@nb.njit(cache=True)
+@borrowing
 def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
                  bx: float, by: float, byaw: float, bl: float, bw: float) -> float:  # fmt: skip
     """Horizontal distance of two boxes, m; 0 where they touch or overlap (then no axis of either separates them)."""
@@ -51,7 +52,7 @@ def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
     return float(np.sqrt(min(d1, d2)))
 
 
-@nb.njit(cache=True)
+@borrowing
 def pose_on(path: Float, s: float) -> tuple[float, float, float]:
     """Pose at arc length `s` of a path (V, 4): s, x, y, yaw by vertex. Beyond its ends it goes straight on."""
     n = len(path)
@@ -83,7 +84,7 @@ class Meeting(NamedTuple):
     other_size: Float  # (2,)
 
 
-@nb.njit(cache=True)
+@borrowing
 def _distance_at(meeting: Meeting, at: float) -> float:
     """Box distance at a place between the instants."""
     along, path, size, other, other_size = meeting
@@ -96,7 +97,7 @@ def _distance_at(meeting: Meeting, at: float) -> float:
     )  # fmt: skip
 
 
-@nb.njit(cache=True)
+@borrowing
 def turning(path: Float, size: Float) -> float:
     """How far a corner of the ego moves per metre of its path, at most."""
     most = 1.0
@@ -121,6 +122,7 @@ def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Fl
         step = np.hypot(other[0, k] - other[0, k - 1], other[1, k] - other[1, k - 1])
         step += half * abs(other[2, k] - other[2, k - 1])
         moved[k] = moved[k - 1] + (0.0 if np.isnan(step) else step)
+    scratch = np.empty((128, 2), np.int64), np.empty((128, 2))
     for r in range(len(along)):
         meeting = Meeting(along[r], path, size, other, other_size)
         best, place = np.inf, np.inf
@@ -132,18 +134,19 @@ def nearest(along: Float, path: Float, size: Float, other: Float, other_size: Fl
             last = first
             while last + 1 < n and not (np.isnan(along[r, last + 1]) or np.isnan(other[0, last + 1])):
                 last += 1
-            best, _ = _search(meeting, moved, most, first, last, best, False)
+            best, _ = _search(meeting, moved, most, first, last, best, False, scratch)
             if best <= _TOUCH_M:
-                _, place = _search(meeting, moved, most, first, last, _TOUCH_M, True)
+                _, place = _search(meeting, moved, most, first, last, _TOUCH_M, True, scratch)
                 best = 0.0
             first = last + 1
         near[r], touch[r] = best, place
 
 
-@nb.njit(cache=True)
+@borrowing
 def _search(
-    meeting: Meeting, moved: Float, most: float, first: int, last: int, best: float, touching: bool
-) -> tuple[float, float]:
+    meeting: Meeting, moved: Float, most: float, first: int, last: int, best: float, touching: bool,
+    scratch: tuple[Int, Float],
+) -> tuple[float, float]:  # fmt: skip
     """Smallest distance between two instants if it is below `best`; or, `touching`, the first place not above `best`.
 
     `moved (T,)`: how far a corner of the other has moved at most, `most` how far one of the ego per metre of its path.
@@ -151,21 +154,16 @@ def _search(
     By halves, the earlier one first. Between two instants it cannot be smaller than half the sum of the distances at
     them less half of what the two have moved meanwhile; a stretch that thus cannot matter is left out.
     """
-    stack = np.empty((128, 2), dtype=np.int64)
-    known = np.empty((128, 2))
-    stack[0] = first, last
-    known[0] = (
-        _distance_at(meeting, float(first)),
-        _distance_at(meeting, float(last)),
-    )
-    if touching and known[0, 0] <= best:
-        return known[0, 0], float(first)
-    best = best if touching else min(best, known[0, 0], known[0, 1])
+    stack, known = scratch
+    d_first, d_last = _distance_at(meeting, float(first)), _distance_at(meeting, float(last))
+    if touching and d_first <= best:
+        return d_first, float(first)
+    best = best if touching else min(best, d_first, d_last)
+    stack[0, 0], stack[0, 1], known[0, 0], known[0, 1] = first, last, d_first, d_last
     depth = 1
     while depth:
         depth -= 1
-        a, b = stack[depth]
-        da, db = known[depth]
+        a, b, da, db = stack[depth, 0], stack[depth, 1], known[depth, 0], known[depth, 1]
         movement = most * (meeting.along[b] - meeting.along[a]) + moved[b] - moved[a]
         if (da + db - movement) / 2 >= best + (1e-12 if touching else -_FINE_M):
             continue
@@ -174,9 +172,10 @@ def _search(
             dm = _distance_at(meeting, float(m))
             if not touching:
                 best = min(best, dm)
-            stack[depth], stack[depth + 1] = (m, b), (a, m)
-            known[depth], known[depth + 1] = (dm, db), (da, dm)
-            depth += 2
+            stack[depth, 0], stack[depth, 1], known[depth, 0], known[depth, 1] = m, b, dm, db
+            depth += 1
+            stack[depth, 0], stack[depth, 1], known[depth, 0], known[depth, 1] = a, m, da, dm
+            depth += 1
             continue
         # Between neighbours both move straight: the distance is convex, and so above the lines on by its values.
         dm = _distance_at(meeting, (a + b) / 2)
@@ -193,7 +192,7 @@ def _search(
     return best, np.inf
 
 
-@nb.njit(cache=True)
+@borrowing
 def _first_touch(meeting: Meeting, clear: float, within: float) -> float:
     """Where between two places, the second in touch, the boxes first touch: by halves."""
     for _ in range(40):
@@ -205,7 +204,7 @@ def _first_touch(meeting: Meeting, clear: float, within: float) -> float:
     return within
 
 
-@nb.njit(cache=True)
+@borrowing
 def _lowest(meeting: Meeting, a: float, b: float) -> tuple[float, float]:
     """Place and value of the smallest distance between two places, which has one valley there: by golden sections."""
     g = (np.sqrt(5.0) - 1) / 2

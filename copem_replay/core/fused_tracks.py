@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba as nb
 import numpy as np
 
 from copem_replay.core.agree import most_probable_of_each
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.core.unit_faults import UnitFaults
@@ -170,7 +170,7 @@ class FusedTracks:
         return result
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def newest_and_first(of: Sources, s: int, p: int) -> tuple[float, int]:
     """Of row p in run s the newest capture, −inf: none, and the unit whose list arrived first, −1: none."""
     newest_s, first, best_s = -np.inf, -1, np.inf
@@ -184,7 +184,7 @@ def newest_and_first(of: Sources, s: int, p: int) -> tuple[float, int]:
     return newest_s, first
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _of_each(of: Sources, newest_s: Float, first: Int) -> None:
     for s in range(newest_s.shape[0]):
         for p in range(newest_s.shape[1]):

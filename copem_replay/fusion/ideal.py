@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 
 from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.kept import KeptEntries, Sent, kept_entries
 from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.core.tracks import NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.covariance import FLATTEST
@@ -203,8 +203,8 @@ def _combine_scalars(heard: Tracks, weighed: Weighed, rows: Int, start: Int, out
     """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances."""
     shape = len(heard.valid), len(start) - 1
     means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
-    which = np.array([*_WEIGHED_BY.values()])
-    _scalars(heard.valid, weighed.scalars, weighed.weights, which, rows, start, means, spreads)
+    which, same = np.array([*_WEIGHED_BY.values()]), np.empty(len(rows), dtype=np.int64)
+    _scalars(heard.valid, weighed.scalars, weighed.weights, which, rows, start, means, spreads, same)
     found = dict(zip(_WEIGHED_BY, means, strict=True))
     out["yaw_rad"] = np.arctan2(found.pop("sin"), found.pop("cos"))
     out.update(found)
@@ -225,7 +225,7 @@ def _any(valid: Bool, rows: Int, start: Int) -> Bool:
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _any_of(valid: Bool, rows: Int, start: Int, out: Bool) -> None:
     for s in range(out.shape[0]):
         for p in range(out.shape[1]):
@@ -253,7 +253,7 @@ class Information(NamedTuple):
     nn: Float
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _combine_position(
     valid: Bool, given: Positions, information: Information, rows: Int, start: Int, out: Positions
 ) -> None:
@@ -285,12 +285,12 @@ def _combine_position(
                 out_x[s, p], out_y[s, p] = x0 + (d * u - b * v) / det, y0 + (a * v - b * u) / det
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _scalars(
-    valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float
-) -> None:
+    valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float,
+    there: Int,
+) -> None:  # fmt: skip
     # Values (S | 1, P, V) and weights (S | 1, P, W), one row where all runs agree; out: what anything contributes to.
-    there = np.empty(len(rows), np.int64)
     for s in range(valid.shape[0]):
         value = values[s if values.shape[0] > 1 else 0]
         weight = weights[s if weights.shape[0] > 1 else 0]

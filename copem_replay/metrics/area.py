@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.tracks import Bool, Float
 
 _EDGE_M = 1e-6
 """So near an edge a place is on it (chosen: rounding is less, and no place is known so well)."""
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def in_polygon(x_m: float, y_m: float, corners_m: Float) -> bool:
     """Whether a place is in a polygon (V, 2), on its edge included. By the number of edges east of it."""
     inside = False
@@ -29,7 +29,7 @@ def in_polygon(x_m: float, y_m: float, corners_m: Float) -> bool:
     return inside
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def in_area(x_m: float, y_m: float, from_x_m: float, from_y_m: float, corners_m: Float, range_m: float) -> bool:
     """Whether a place is within a range of another one, and in a polygon; `corners_m` without corners: anywhere."""
     if np.hypot(x_m - from_x_m, y_m - from_y_m) > range_m + _EDGE_M:

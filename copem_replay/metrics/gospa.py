@@ -22,6 +22,7 @@ import numba as nb
 import numpy as np
 
 from copem_replay.core.assignment import assign_pairs
+from copem_replay.core.kernels import making
 from copem_replay.core.tracks import Float, Int
 
 
@@ -79,7 +80,7 @@ def ospa(truth: Float, estimates: Float, *, cutoff_m: float, power: float) -> fl
     return float(((result.localisation + alone) / max(n, m)) ** (1 / power))
 
 
-@nb.njit(cache=True, nogil=True)
+@making
 def gospa_pairs(
     tx: Float, ty: Float, bx: Float, by: Float, cutoff_m: float, power: float, partner: Int
 ) -> tuple[float, int]:
@@ -92,6 +93,9 @@ def gospa_pairs(
     for i in range(n):
         for j in range(m):
             near += (tx[i] - bx[j]) ** 2 + (ty[i] - by[j]) ** 2 < cutoff_m * cutoff_m
+    if near == 0:
+        partner[:n] = -1
+        return 0.0, 0
     row, col, cost = np.empty(near, np.int64), np.empty(near, np.int64), np.empty(near)
     unit = cutoff_m**power
     k = 0

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from copem_replay.core.agree import AGREE
 from copem_replay.core.agree import most_probable as most_probable_class
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.object_list import Entries, ObjectLists, TellsOf
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Tracks
 
@@ -115,7 +116,7 @@ def _rows(world: Tracks, scene: Scene, *, by_frame: bool) -> _Rows:
     )  # fmt: skip
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def most_probable(entries: Entries, i: int) -> int:
     """The most probable class of entry i; of equally probable ones the first, `other` where nothing is said."""
     return most_probable_class(entries[i].class_probability)
@@ -126,14 +127,24 @@ def _match(
     start: Int, entries: Entries, rows: _Rows, now: _Rows, agree: Bool, gate_m: float, about: _Out, at_once: _Out
 ) -> None:
     # `now`, `at_once`: the second question; the same as the first one where there is none.
-    longest, both = 0, rows.by_frame != now.by_frame
+    longest = 0
     for s in range(len(start)):
         for k in range(start.shape[1] - 1):
             longest = max(longest, start[s, k + 1] - start[s, k])
     # Of the list at hand: with which frame each entry is compared, and those that are to be asked again.
     frame, others = np.empty(longest, np.int64), np.empty(longest, np.int64)
-    for k in range(start.shape[1] - 1):
-        for s in range(len(start)):
+    _each_list(start, entries, rows, now, agree, gate_m, about, at_once, (frame, others))
+
+
+@borrowing
+def _each_list(
+    start: Int, entries: Entries, rows: _Rows, now: _Rows, agree: Bool, gate_m: float, about: _Out, at_once: _Out,
+    scratch: tuple[Int, Int],
+) -> None:  # fmt: skip
+    frame, others = scratch
+    both = rows.by_frame != now.by_frame
+    for s in range(len(start)):
+        for k in range(start.shape[1] - 1):
             first, n = start[s, k], start[s, k + 1] - start[s, k]
             for i in range(first, first + n):
                 about.class_ix[i] = most_probable_class(entries[i].class_probability)
@@ -155,7 +166,7 @@ def _match(
                     at_once.x_m[i], at_once.y_m[i] = about.x_m[i], about.y_m[i]
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None:
     # The frame at the capture of each entry of a list, −1: there is none.
     f, last = 0, len(frame_s) - 1
@@ -168,7 +179,7 @@ def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None
         out[j] = f if last >= 0 and abs(frame_s[f] - at_s) <= _TOLERANCE_S else -1
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _one_list(
     entries: Entries, first: int, frame: Int, others: Int, rows: _Rows, agree: Bool, gate_m: float, out: _Out
 ) -> None:
@@ -218,7 +229,7 @@ def _one_list(
             match_of[object_ix[i]] = -1
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _nearest(
     x: float, y: float, of: int, first: int, high: int, gate_m: float, agree: Bool, object_ix: Int,
     class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool,
@@ -243,7 +254,7 @@ def _nearest(
     return best
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _preferred(entries: Entries, i: int, j: int) -> bool:
     a, b = entries[i], entries[j]
     if a.existence != b.existence:
@@ -262,7 +273,7 @@ def _preferred(entries: Entries, i: int, j: int) -> bool:
     return most_probable(entries, i) < most_probable(entries, j)
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _in_order_of_preference(entries: Entries, those: Int, n: int) -> None:
     # Shell's sort with the gaps of Knuth, (3ʰ − 1) / 2.
     gap = 1

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.fused_tracks import FusedTracks, Sources, newest_and_first
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists
 from copem_replay.core.tracks import NO_CAPTURE_NS, VALUES, Bool, Float, Int, Scene, Tracks
 from copem_replay.fusion.ideal import floored
@@ -46,7 +46,7 @@ _CLASS = _EXISTENCE + 1
 """Places in an entry, in words of eight bytes; the states are at its beginning."""
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _fill(
     valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: Sources,
     start: Int, words: Float, whose: Int,
@@ -59,7 +59,8 @@ def _fill(
             for p in order[bounds[f] : bounds[f + 1]]:
                 if not valid[s, p]:
                     continue
-                words[n, :_EXISTENCE] = states[:, s if states.shape[1] > 1 else 0, p]
+                for v in range(_EXISTENCE):
+                    words[n, v] = states[v, s if states.shape[1] > 1 else 0, p]
                 words[n, _EXISTENCE] = 1.0
                 words[n, _CLASS:_CAPTURED] = 0.0
                 words[n, _CLASS + classes[p]] = 1.0

@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int
 from copem_replay.metrics.accuracy.nees import expected, nees
@@ -99,6 +100,7 @@ class _Here(NamedTuple):
 class _Targets(NamedTuple):
     # Those of them that are looked at now: the truth of GOSPA.
     episode: Int
+    column: Int  # of this list in the arrays list by list
     x_m: Float
     y_m: Float
     partner: Int
@@ -131,16 +133,34 @@ def add_up(
         np.empty(M, np.int64), np.empty(M, np.int64), np.full(M, -1),
     )  # fmt: skip
     targets = _Targets(
-        np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64), np.empty(M, np.int64)
+        np.empty(M, np.int64), np.empty(M, np.int64), np.empty(M), np.empty(M), np.empty(M, np.int64),
+        np.empty(M, np.int64),
     )  # fmt: skip
     estimates = _Estimates(np.empty(longest), np.empty(longest), np.empty(longest, np.bool_))
+    _each_list(
+        start, entries, about, now, issue_s, world, stays, (reference_x_m, reference_y_m, present), asked, so_far, out,
+        (here, targets, estimates),
+    )  # fmt: skip
+
+
+@borrowing
+def _each_list(
+    start: Int, entries: Entries, about: Found, now: Found, issue_s: Float, world: World, stays: Stays,
+    reference: tuple[Float, Float, Bool], asked: Asked, so_far: SoFar, out: Sums,
+    scratch: tuple[_Here, _Targets, _Estimates],
+) -> None:  # fmt: skip
+    reference_x_m, reference_y_m, present = reference
+    here, targets, estimates = scratch
+    S = len(out.by_object)
+    # What is expected of a covariance: of one list after the other it is mostly the same one.
+    large_m2 = small_m2 = np.nan
+    beyond = mean = second = np.nan
     for k in range(len(issue_s)):
         if not present[k]:
             continue
         from_m = (reference_x_m[k], reference_y_m[k])
         n, wanted = _gather(k, issue_s[k], world, stays, from_m, asked, here, targets)
         time_band = _band(asked.time_edges_s, issue_s[k])
-        column = stays.column + (k - stays.first_list)
         for s in range(S):
             here.pair[:n] = -1
             here.match[:n] = -1
@@ -161,27 +181,27 @@ def add_up(
                     continue
                 entry, sums = entries[i], out.by_object[s, m]
                 then_east_m, then_north_m = entry.x_m - about.x_m[i], entry.y_m - about.y_m[i]
-                of, large_m2, small_m2 = nees(
-                    entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m
-                )
-                beyond, mean, second = expected(large_m2, small_m2, asked.gate_m)
+                of, large, small = nees(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m)
+                if large != large_m2 or small != small_m2:
+                    large_m2, small_m2 = large, small
+                    beyond, mean, second = expected(large, small, asked.gate_m)
                 square_m2, age_of_information_s = then_east_m**2 + then_north_m**2, issue_s[k] - entry.captured_s
                 _further(sums, entry, square_m2, beyond, second, age_of_information_s, m, so_far.last_track[s])
                 east_m = north_m = np.nan
                 if p >= 0:
                     east_m, north_m = entry.x_m - world.x_m[p], entry.y_m - world.y_m[p]
-                    out.error_m[s, column[m]] = np.hypot(east_m, north_m)
+                    out.error_m[s, stays.column[m] + k - stays.first_list[m]] = np.hypot(east_m, north_m)
                     vx_mps, vy_mps = entry.vx_mps - world.vx_mps[p], entry.vy_mps - world.vy_mps[p]
                     sums.velocity_square_m2ps2 += vx_mps**2 + vy_mps**2
                 _add_pair(out.by_object[s], m, east_m, north_m, of, mean)
                 _add_pair(out.by_distance[s], here.distance_band[h], east_m, north_m, of, mean)
                 _add_pair(out.by_time[s], time_band, east_m, north_m, of, mean)
-            _gospa(out.gospa[s], column, out.by_object[s], out.by_run[s], targets, wanted, estimates, count, asked)
+            _gospa(out.gospa[s], out.by_object[s], out.by_run[s], targets, wanted, estimates, count, asked)
         for h in range(n):
             here.place_of[here.episode[h]] = -1
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
     """Add what ends with the episodes, after all lists."""
     S, M = out.by_object.shape
@@ -192,7 +212,7 @@ def close(stays: Stays, so_far: SoFar, out: Sums) -> None:
                 sums.longest_gap_s = max(sums.longest_gap_s, stays.ended_s[m] - so_far.unknown_since_s[s, m])
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _gather(
     k: int, issue_s: float, world: World, stays: Stays, from_m: tuple[float, float], asked: Asked, here: _Here,
     targets: _Targets,
@@ -208,7 +228,8 @@ def _gather(
         here.distance_band[n], here.target[n] = _band(asked.distance_edges_m, away_m), -1
         if issue_s >= stays.onset_s[m] - _TOLERANCE_S:
             here.target[n] = wanted
-            targets.episode[wanted], targets.x_m[wanted], targets.y_m[wanted] = m, world.x_m[p], world.y_m[p]
+            targets.episode[wanted], targets.column[wanted] = m, stays.column[m] + k - stays.first_list[m]
+            targets.x_m[wanted], targets.y_m[wanted] = world.x_m[p], world.y_m[p]
             wanted += 1
         n += 1
     for m in range(len(stays.lists)):
@@ -219,7 +240,7 @@ def _gather(
     return n, wanted
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _entries(
     s: int, first: int, after: int, entries: Entries, about: Found, now: Found, stays: Stays,
     from_m: tuple[float, float], time_band: int, asked: Asked, here: _Here, targets: _Targets, wanted: int,
@@ -271,7 +292,7 @@ def _entries(
     return count
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _ghost(
     s: int, x_m: float, y_m: float, existence: float, stale: bool, from_m: tuple[float, float], time_band: int,
     asked: Asked, targets: _Targets, wanted: int, out: Sums,
@@ -292,7 +313,7 @@ def _ghost(
         out.by_object[s, targets.episode[nearest]].ghosts += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _look(records: Records, at: int, match: int) -> None:
     if at >= 0:
         records[at].looked += 1
@@ -300,7 +321,7 @@ def _look(records: Records, at: int, match: int) -> None:
             records[at].missed += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _follow(sums: Any, m: int, match: int, issue_s: float, stays: Stays, unknown_since_s: Float) -> None:
     # How long it is unknown, which goes on from list to list. −1: no match.
     now_s = min(max(issue_s, stays.onset_s[m]), stays.ended_s[m])
@@ -312,7 +333,7 @@ def _follow(sums: Any, m: int, match: int, issue_s: float, stays: Stays, unknown
         unknown_since_s[m] = np.nan
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _further(
     sums: Any,
     entry: Any,
@@ -335,7 +356,7 @@ def _further(
         last_track[m] = track
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _add_pair(records: Records, at: int, east_m: float, north_m: float, of: float, mean: float) -> None:
     # NaN: the object is not there now.
     if at < 0:
@@ -351,9 +372,9 @@ def _add_pair(records: Records, at: int, east_m: float, north_m: float, of: floa
         sums.north_m += north_m
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _gospa(
-    gospa: NDArray[np.float32], column: Int, by_object: Records, sums: Any, targets: _Targets, wanted: int,
+    gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: _Targets, wanted: int,
     estimates: _Estimates, count: int, asked: Asked,
 ) -> None:  # fmt: skip
     # One list's GOSPA, handed out to the objects, and its OSPA: the same pairs are the best ones for both.
@@ -387,10 +408,10 @@ def _gospa(
         by_object[m].gospa_localisation += located
         by_object[m].gospa_missed += missed
         by_object[m].gospa_false += false
-        gospa[column[m]] = located + missed + false
+        gospa[targets.column[t]] = located + missed + false
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _nearest(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
     # The target nearest to a place, of equally near ones the first; −1: there are none.
     best, least = -1, np.inf
@@ -401,7 +422,7 @@ def _nearest(x_m: float, y_m: float, targets: _Targets, wanted: int) -> int:
     return best
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _band(edges: Float, value: float) -> int:
     # The band that holds the value, its lower edge included, its upper one not; −1: none.
     band = int(np.searchsorted(edges, value, side="right")) - 1

@@ -11,8 +11,9 @@ Source: χ² of two degrees of freedom is the exponential distribution of mean 2
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
+
+from copem_replay.core.kernels import borrowing
 
 SMALLEST_VARIANCE_M2 = 1e-9
 """Eigenvalues of a covariance count as at least this (the contract's)."""
@@ -29,7 +30,7 @@ _SMALL = 1e-3
 _LEAST = 1e-30
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def nees(a: float, b: float, d: float, east_m: float, north_m: float) -> tuple[float, float, float]:
     """eᵀP⁻¹e of an error and P = ((a, b), (b, d)), and the eigenvalues of P, the larger first: (1, m², m²)."""
     half, turn = (a + d) / 2, np.hypot((a - d) / 2, b)
@@ -39,7 +40,7 @@ def nees(a: float, b: float, d: float, east_m: float, north_m: float) -> tuple[f
     return float(u * u / large + v * v / small), large, small
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def expected(large_m2: float, small_m2: float, gate_m: float) -> tuple[float, float, float]:
     """The share beyond a gate, mean NEES and mean squared NEES of what is within, for such eigenvalues."""
     square = gate_m * gate_m
@@ -61,7 +62,7 @@ def expected(large_m2: float, small_m2: float, gate_m: float) -> tuple[float, fl
     return beyond / n, (2 * n - first) / within, (8 * n - second) / within
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _of_little(large_m2: float, small_m2: float, square: float) -> tuple[float, float, float]:
     # The same where next to nothing is within: the first terms of their series, for the differences are but rounding.
     within = first = second = 0.0

@@ -5,10 +5,10 @@ Letters as in core/box_distance.py: T instants, V path vertices, R courses of th
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from copem_replay.core.box_distance import box_distance, pose_on, turning
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.tracks import Float
 
 _STRIDE_M = 1e-3
@@ -17,7 +17,7 @@ _INSIDE_M = 0.1
 """The step along a path in search of where it is clear again (chosen: a gap shorter than this may be missed)."""
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def blocked(
     path: Float, size: Float, other: Float, other_size: Float, margin_m: float, from_m: float, to_m: Float, out: Float
 ) -> None:
@@ -47,7 +47,7 @@ def blocked(
             clear, found = s, found + 1
 
 
-@nb.njit(cache=True)
+@borrowing
 def _free(path: Float, size: Float, other: Float, other_size: Float, margin_m: float, s: float) -> float:
     """What is left between the ego at a place of its path and the other, beyond the margin."""
     x, y, yaw = pose_on(path, s)
@@ -56,7 +56,7 @@ def _free(path: Float, size: Float, other: Float, other_size: Float, margin_m: f
     )
 
 
-@nb.njit(cache=True)
+@borrowing
 def _border(
     path: Float, size: Float, other: Float, other_size: Float, margin_m: float, clear: float, within: float
 ) -> float:
@@ -70,7 +70,7 @@ def _border(
     return within
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def required(time_s: Float, stretch_m: Float, begin_s: Float, begin_m: Float, speed_mps: Float, out: Float) -> None:
     """Smallest constant deceleration (R,) from `begin_s (R,)` on that is never in `stretch_m (B, 2, T)`; inf: none.
 
@@ -93,7 +93,7 @@ def required(time_s: Float, stretch_m: Float, begin_s: Float, begin_m: Float, sp
         out[r] = a
 
 
-@nb.njit(cache=True)
+@borrowing
 def _to_be_at(way_m: float, after_s: float, speed_mps: float) -> float:
     """Constant deceleration that has gone `way_m` after a time, at most: inf where nothing is that short.
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numba as nb
 import numpy as np
 
 from copem_replay.core.box_distance import nearest
+from copem_replay.core.kernels import borrowing
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.blocked import required
 from copem_replay.metrics.braking.driver import UNRESOLVED, Driver, Reaction, deceleration_of, delays_of, survival_of
@@ -99,7 +99,7 @@ def braked(encounter: Encounter, driver: Driver, brake_s: Float) -> tuple[Float,
     return way, speed
 
 
-@nb.njit(cache=True, nogil=True)
+@borrowing
 def _drive(
     time_s: Float, along_m: Float, bound_m: Float, recorded_mps: Float, begin_s: Float, begin_m: Float,
     begin_mps: Float, deceleration: Float, way: Float, speed: Float,

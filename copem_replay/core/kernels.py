@@ -1,0 +1,16 @@
+"""Compiled functions of inner loops, and the references to arrays that Numba counts.
+
+At each call Numba counts, atomically, references to each array that is handed over. Of a function called for each entry
+that takes several times as long as what it does. The option is private to Numba, and what is called inherits it:
+docs/develop/decisions/0039-counted-references.md.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+
+borrowing = nb.njit(cache=True, nogil=True, _nrt=False)
+"""As `nb.njit`, for functions that make no array and return none: what they are handed outlives them."""
+
+making = nb.njit(cache=True, nogil=True, _nrt=True)
+"""As `nb.njit`, for functions that make arrays and are called by such."""
