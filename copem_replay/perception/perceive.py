@@ -125,31 +125,29 @@ def _with_errors(seen: Tracks, found: Observations, experiment: PerceptionSetup,
                 continue
             where = f"pems.{unit.pem}[{c}].error"
             drawn = None if draws is None else draws.take(rows)
-            noise = partial(_noise, drawn, pem.memory_of(c), seen.valid[:, rows])
+            # Rows one after the other are looked at in place, others copied.
+            at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
+            noise = partial(_noise, drawn, pem.memory_of(c), seen.valid[:, at])
             errors = errors_of(couple.error, found.view.take(rows), noise, S, where)
-            per_run("x_m")[:, rows] += errors.east_m
-            per_run("y_m")[:, rows] += errors.north_m
+            per_run("x_m")[:, at] += errors.east_m
+            per_run("y_m")[:, at] += errors.north_m
             for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2"):
-                spread[name][0, rows] = getattr(errors, name)
+                spread[name][0, at] = getattr(errors, name)
             if errors.yaw_rad is not None:
                 yaw = per_run("yaw_rad")
-                yaw[:, rows] = wrap(yaw[:, rows] + errors.yaw_rad)
-                spread["yaw_var_rad2"][0, rows] = errors.yaw_var_rad2
+                yaw[:, at] = wrap(yaw[:, at] + errors.yaw_rad)
+                spread["yaw_var_rad2"][0, at] = errors.yaw_var_rad2
             if errors.size_m is not None:
                 for axis, name in enumerate(("length_m", "width_m", "height_m")):
                     size = per_run(name)
-                    size[:, rows] = np.maximum(size[:, rows] + errors.size_m[axis], SMALLEST_SIZE_M)
-                spread["size_var_m2"][0, rows] = errors.size_var_m2
+                    size[:, at] = np.maximum(size[:, at] + errors.size_m[axis], SMALLEST_SIZE_M)
+                spread["size_var_m2"][0, at] = errors.size_var_m2
             if errors.speed_mps is not None:
                 speed = found.view.speed_mps[rows]
                 # Along the direction of travel; of the heading where the object stands.
-                east = np.where(
-                    speed > 0, seen.vx_mps[0, rows] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, rows])
-                )
-                north = np.where(
-                    speed > 0, seen.vy_mps[0, rows] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, rows])
-                )
-                per_run("vx_mps")[:, rows] += errors.speed_mps * east
-                per_run("vy_mps")[:, rows] += errors.speed_mps * north
-                spread["speed_var_m2ps2"][0, rows] = errors.speed_var_m2ps2
+                east = np.where(speed > 0, seen.vx_mps[0, at] / np.maximum(speed, 1e-9), np.cos(seen.yaw_rad[0, at]))
+                north = np.where(speed > 0, seen.vy_mps[0, at] / np.maximum(speed, 1e-9), np.sin(seen.yaw_rad[0, at]))
+                per_run("vx_mps")[:, at] += errors.speed_mps * east
+                per_run("vy_mps")[:, at] += errors.speed_mps * north
+                spread["speed_var_m2ps2"][0, at] = errors.speed_var_m2ps2
     return seen.with_values(**columns, **spread)

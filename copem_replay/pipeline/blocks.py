@@ -38,11 +38,15 @@ BLOCK_BYTES = 200_000_000
 STATE_BYTES = 400
 """Bytes of a row × run cell where states are sampled, fused and measured, else one (chosen: fifty numbers)."""
 
+TRACK_BYTES = 100
+"""The same where all fuse by truth id, and of each row that they make of those of the units `STATE_BYTES` (measured:
+40 to 170 in all of 21 units, 500 of one)."""
+
 LASTING_BYTES = 40
 """Without states, where detection lasts: numbers themselves, not only whether they are below p (chosen)."""
 
-WORTH_A_BLOCK = 1_000_000
-"""Row × run cells below which a block is not cut further (chosen: a few milliseconds)."""
+WORTH_A_BLOCK = 2_000_000
+"""Row × run cells below which a block is not cut further (chosen: what is the same for all runs takes a tenth)."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,12 @@ def blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, i
     # Smaller ones show progress and can be interrupted sooner, down to a size at which they would only cost time.
     small = max(-(-even // 8), WORTH_A_BLOCK // rows)
     lasts = any(pem.memory_of(c).get("detection") for pem in experiment.pems.values() for c in range(len(pem.couples)))
-    at_once = BLOCK_BYTES // (rows * (STATE_BYTES if states else LASTING_BYTES if lasts else 1))
+    cell = LASTING_BYTES if lasts else 1
+    if states:
+        cell = STATE_BYTES
+        if not _matches(experiment):
+            cell = min(cell, TRACK_BYTES + STATE_BYTES // max(len(replay.expanded.units), 1))
+    at_once = BLOCK_BYTES // (rows * cell)
     size = max(1, min(at_once, even, small))
     return [np.arange(k, min(k + size, end)) for k in range(begin, end, size)]
 
