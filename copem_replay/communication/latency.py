@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
-from scipy.special import gammaincinv, ndtri
 
 from copem_replay.core.components import Component, GivenError, Latency, Positive, Slot, asked
 from copem_replay.core.tracks import Float
@@ -81,6 +80,8 @@ class GammaLatency(LatencyModel):
 
     def delays(self, uniform: Float) -> Float:
         """(K,) quantiles."""
+        from scipy.special import gammaincinv  # it takes long to import
+
         result: Float = self.min_s + (self.mean_s - self.min_s) / self.shape * gammaincinv(self.shape, uniform)
         return result
 
@@ -95,6 +96,8 @@ class LognormalLatency(LatencyModel):
 
     def delays(self, uniform: Float) -> Float:
         """(K,) quantiles."""
+        from scipy.special import ndtri  # as above
+
         result: Float = self.min_s + self.median_s * np.exp(self.sigma * ndtri(uniform))
         return result
 

@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
-from scipy.special import ndtr
 
 from copem_replay.core.components import Component, GivenError, NotNegative, Number, Positive, Share, asked
 from copem_replay.core.grid import bilinear, check_grid
@@ -143,6 +142,8 @@ class Shadowing(ReceptionModel):
         with np.errstate(divide="ignore"):
             margin_db = 10 * self.exponent * np.log10(self.half_at_m / np.maximum(path.distance_m, NEAR_M))
         margin_db = margin_db - np.where(path.visible_share < BLOCKED, self.blocked_db, 0.0)
+        from scipy.special import ndtr  # it takes long to import
+
         result: Float = ndtr(margin_db / self.sigma_db)
         return result
 
