@@ -7,10 +7,16 @@ docs/develop/decisions/0039-counted-references.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import numba as nb
 
-borrowing = nb.njit(cache=True, nogil=True, _nrt=False)
+Function = TypeVar("Function", bound=Callable[..., Any])
+_njit: Any = nb.njit  # whose stubs leave the option out
+
+borrowing: Callable[[Function], Function] = _njit(cache=True, nogil=True, _nrt=False)
 """As `nb.njit`, for functions that make no array and return none: what they are handed outlives them."""
 
-making = nb.njit(cache=True, nogil=True, _nrt=True)
+making: Callable[[Function], Function] = _njit(cache=True, nogil=True, _nrt=True)
 """As `nb.njit`, for functions that make arrays and are called by such."""

@@ -185,7 +185,6 @@ def _runs(outcomes: Sequence[Outcome], names: Sequence[str]) -> pa.Table:
     for row in rows:  # those of the run before are written once
         same = before.get(row["configuration"])
         before[row["configuration"]] = row["available_s"]
-        row["available_s"] = (
-            None if same is not None and np.array_equal(same, row["available_s"]) else row["available_s"]
-        )
+        if same is not None and (same is row["available_s"] or np.array_equal(same, row["available_s"])):
+            row["available_s"] = None
     return pa.Table.from_pylist(rows, RUNS)
