@@ -203,8 +203,9 @@ def _combine_scalars(heard: Tracks, weighed: Weighed, rows: Int, start: Int, out
     """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances."""
     shape = len(heard.valid), len(start) - 1
     means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
-    which, same = np.array([*_WEIGHED_BY.values()]), np.empty(len(rows), dtype=np.int64)
-    _scalars(heard.valid, weighed.scalars, weighed.weights, which, rows, start, means, spreads, same)
+    scratch = np.empty(len(rows), np.int64), np.empty((shape[1], len(_WEIGHED_BY)), np.bool_)
+    which = np.array([*_WEIGHED_BY.values()])
+    _scalars(heard.valid, weighed.scalars, weighed.weights, which, rows, start, means, spreads, scratch)
     found = dict(zip(_WEIGHED_BY, means, strict=True))
     out["yaw_rad"] = np.arctan2(found.pop("sin"), found.pop("cos"))
     out.update(found)
@@ -288,9 +289,15 @@ def _combine_position(
 @borrowing
 def _scalars(
     valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float,
-    there: Int,
+    scratch: tuple[Int, Bool],
 ) -> None:  # fmt: skip
     # Values (S | 1, P, V) and weights (S | 1, P, W), one row where all runs agree; out: what anything contributes to.
+    there, alike = scratch
+    for p in range(len(start) - 1):  # whether all that may contribute say the same, in any run
+        for v in range(values.shape[2]):
+            alike[p, v] = values.shape[0] == 1
+            for c in range(start[p] + 1, start[p + 1]):
+                alike[p, v] &= values[0, rows[c], v] == values[0, rows[start[p]], v]
     for s in range(valid.shape[0]):
         value = values[s if values.shape[0] > 1 else 0]
         weight = weights[s if weights.shape[0] > 1 else 0]
@@ -310,7 +317,7 @@ def _scalars(
             for v in range(means.shape[0]):
                 w, first = weighed_by[v], value[there[0], v]
                 moment = 0.0
-                for c in range(1, n):
+                for c in range(1, 1 if alike[p, v] else n):
                     moment += weight[there[c], w] * (value[there[c], v] - first)
                 if moment != 0.0:
                     total = 0.0
