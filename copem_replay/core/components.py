@@ -14,6 +14,7 @@ from copy import deepcopy
 from importlib.metadata import entry_points
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -29,6 +30,7 @@ from pydantic_core import PydanticCustomError, core_schema
 
 from copem_replay.core.errors import InputError
 from copem_replay.core.own_code import FAILURES, failed, is_own, written_at
+from copem_replay.core.tracks import Float
 
 T = TypeVar("T")
 
@@ -74,6 +76,24 @@ def asked(component: Component, where: str, work: Callable[[], T]) -> T:
 def wrong(component: Component, where: str, message: str, *methods: str) -> InputError:
     """The error that what a component gave is wrong, with file and line of the first of these methods that is own."""
     return InputError(f"{where}: {component.kind}: {message}{written_at(type(component), *methods)}")
+
+
+def numbers_of(
+    component: Component, where: str, call: str, answer: Callable[[], Any], shape: tuple[int, ...], said: str,
+    most: float = np.finfo(np.float64).max,
+) -> Float:  # fmt: skip
+    """Numbers from 0 to `most` that a component answers to a call, `probability(view)`. Raises InputError for others.
+
+    `said`: what is expected of them.
+    """
+    method = call.partition("(")[0]
+    found = asked(component, where, lambda: np.asarray(answer(), dtype=np.float64))
+    if found.shape != shape:
+        raise wrong(component, where, f"{call}: expected shape {shape}, found {found.shape}", method)
+    beyond = ~((found >= 0) & (found <= most))
+    if beyond.any():
+        raise wrong(component, where, f"{call}: expected {said}, found {found[beyond][0]}", method)
+    return found
 
 
 _LARGEST = 1e12

@@ -13,7 +13,6 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -22,25 +21,13 @@ from pydantic_core import PydanticKnownError
 
 from copem_replay.core.components import Component, Slot, asked, wrong
 from copem_replay.core.own_code import is_own
-from copem_replay.core.tracks import Bool, Float, Int, Tracks
-from copem_replay.perception.visibility_kernel import Boxes, Obstacles, Places, views
+from copem_replay.core.tracks import Float, Int, Tracks
+from copem_replay.perception.visibility_kernel import Boxes, views
+from copem_replay.perception.visibility_kernel import Observers as Observers
+from copem_replay.perception.visibility_kernel import Statics as Statics
 
 _ROWS_PER_THREAD = 20_000
 """Below this many views a thread costs more than it brings (chosen)."""
-
-
-@dataclass(frozen=True)
-class Statics:
-    """Static obstacles as convex parts: `xy_m (V, 2)` counter-clockwise, parts `start (G + 1,)`.
-
-    `body (G,)` says which obstacle a part belongs to; `bottom_m`, `top_m (G,)` are heights in the world.
-    """
-
-    xy_m: Float
-    start: Int
-    body: Int
-    bottom_m: Float
-    top_m: Float
 
 
 def statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m: Sequence[float]) -> Statics:
@@ -70,18 +57,6 @@ def statics(polygons: Sequence[Float], bottom_m: Sequence[float], height_m: Sequ
 NO_STATICS = Statics(
     np.empty((0, 2)), np.zeros(1, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
 )
-
-
-@dataclass(frozen=True)
-class Observers:
-    """Where units are at each list of a world: `place_m (U, F, 3)`, whether they are there `present (U, F)`.
-
-    `carrier_ix (U,)`: the object that carries each, −1: none.
-    """
-
-    place_m: Float
-    present: Bool
-    carrier_ix: Int
 
 
 class VisibilityModel(Component, ABC):
@@ -226,9 +201,8 @@ def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, 
         return out, blocker
     z, half = world.z_m[0, order], world.height_m[0, order] / 2
     boxes = Boxes(bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order])
-    obstacles = Obstacles(static.xy_m, static.start, static.body, static.bottom_m, static.top_m)
     place_m, present = np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present)
-    places = Places(place_m, present, observers.carrier_ix)
+    places = Observers(place_m, present, observers.carrier_ix)
     threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
@@ -236,9 +210,7 @@ def _views(world: Tracks, static: Statics, observers: Observers, *, flat: bool, 
     edges = [0, *sorted(int(c) for c in cuts), n_frames]
     with ThreadPoolExecutor(threads) as pool:
         list(
-            pool.map(
-                lambda k: views(edges[k], edges[k + 1], boxes, obstacles, places, flat, out, blocker), range(pieces)
-            )
+            pool.map(lambda k: views(edges[k], edges[k + 1], boxes, static, places, flat, out, blocker), range(pieces))
         )
     return out, blocker
 

@@ -30,8 +30,11 @@ class Boxes(NamedTuple):
     object_ix: Int
 
 
-class Obstacles(NamedTuple):
-    """Convex parts of static obstacles, see `Statics`."""
+class Statics(NamedTuple):
+    """Static obstacles as convex parts: `xy_m (V, 2)` counter-clockwise, parts `start (G + 1,)`.
+
+    `body (G,)` says which obstacle a part belongs to; `bottom_m`, `top_m (G,)` are heights in the world.
+    """
 
     xy_m: Float
     start: Int
@@ -40,8 +43,11 @@ class Obstacles(NamedTuple):
     top_m: Float
 
 
-class Places(NamedTuple):
-    """Where units are at each list, see `Observers`."""
+class Observers(NamedTuple):
+    """Where units are at each list of a world: `place_m (U, F, 3)`, whether they are there `present (U, F)`.
+
+    `carrier_ix (U,)`: the object that carries each, −1: none.
+    """
 
     place_m: Float
     present: Bool
@@ -82,7 +88,7 @@ _MAX_PIECES = 512
 
 @nb.njit(cache=True, nogil=True)
 def views(
-    f0: int, f1: int, boxes: Boxes, obstacles: Obstacles, places: Places, flat: bool, out: Float, blocker: Int
+    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, flat: bool, out: Float, blocker: Int
 ) -> None:
     """Visible shares `out (U, P)` of the lists f0 … f1 − 1.
 

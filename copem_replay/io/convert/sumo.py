@@ -45,7 +45,7 @@ def frames(path: Path, report: Report, *, type_files: Iterable[Path] = (), host:
             if node.tag == "person" and node.attributes.get("vehicle"):
                 report.count("person", "in a vehicle at a time step: skipped")
                 continue
-            key = node.tag, _attribute(node, path, "id")
+            key = node.tag, node.attribute("id", path)
             met |= key == ("vehicle", host)
             ident = ids.setdefault(key, len(ids) + 1)
             report.names[ident] = " ".join(key)
@@ -73,7 +73,7 @@ def _type(node: Node, known: dict[str, VehicleType], report: Report) -> VehicleT
 
 def _box(ident: int, node: Node, kind: VehicleType, path: Path, report: Report) -> Box:
     x, y, angle_deg = (
-        number(_attribute(node, path, name), f"{path}:{node.line}: {name}") for name in ("x", "y", "angle")
+        number(node.attribute(name, path), f"{path}:{node.line}: {name}") for name in ("x", "y", "angle")
     )
     ground_m = number(node.attributes.get("z", 0.0), f"{path}:{node.line}: z")
     if "z" not in node.attributes:
@@ -88,10 +88,3 @@ def _box(ident: int, node: Node, kind: VehicleType, path: Path, report: Report) 
         velocity = (speed_mps * cos, speed_mps * sin)
     at_m = (x - back_m * cos, y - back_m * sin, ground_m + height_m / 2)
     return Box(ident, kind.kind, at_m, wrapped(yaw_rad), kind.size_m, velocity)
-
-
-def _attribute(node: Node, path: Path, name: str) -> str:
-    if (value := node.attributes.get(name)) is None:
-        found = ", ".join(node.attributes) or "none"
-        raise InputError(f"{path}:{node.line}: expected <{node.tag}> with the attribute {name}, found {found}")
-    return value

@@ -70,7 +70,7 @@ def types(files: Iterable[Path]) -> dict[str, VehicleType]:
         for part in parts(path, ("routes", "additional")):
             for node in [part, *part.children]:  # on their own, or in a vTypeDistribution
                 if node.tag == "vType":
-                    found[_attribute(node, path, "id")] = _type(node, path)
+                    found[node.attribute("id", path)] = _type(node, path)
         if len(found) == before:
             raise InputError(f"{path}: expected vehicle types (<vType>), found no further one")
     return found
@@ -86,10 +86,3 @@ def _type(node: Node, path: Path) -> VehicleType:
         for key, value in zip(("length", "width", "height"), default.size_m, strict=True)
     )
     return VehicleType(default.kind, (length, width, height))
-
-
-def _attribute(node: Node, path: Path, name: str) -> str:
-    if (value := node.attributes.get(name)) is None:
-        found = ", ".join(node.attributes) or "none"
-        raise InputError(f"{path}:{node.line}: expected <{node.tag}> with the attribute {name}, found {found}")
-    return value

@@ -31,6 +31,13 @@ class Node:
         """Children of that tag."""
         return [child for child in self.children if child.tag == tag]
 
+    def attribute(self, name: str, path: Path) -> str:
+        """What an attribute says. Raises InputError: there is none."""
+        if (value := self.attributes.get(name)) is None:
+            found = ", ".join(self.attributes) or "none"
+            raise InputError(f"{path}:{self.line}: expected <{self.tag}> with the attribute {name}, found {found}")
+        return value
+
     def find(self, *tags: str) -> Node | None:
         """Return the first child of the first tag, its first child of the next, and so on."""
         node: Node | None = self

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from copem_replay.core.components import Component, NotNegative, Positive, Slot, asked, wrong
+from copem_replay.core.components import Component, NotNegative, Positive, Slot, asked, numbers_of, wrong
 from copem_replay.core.tracks import Float
 
 _SHORTEST_S = 0.05
@@ -163,13 +163,9 @@ DRIVERS = {"constant_deceleration": "copem_replay.metrics.braking.driver:Constan
 def delays_of(reaction: Reaction, uniform: Float) -> Float:
     """(K,) what a reaction model says of uniform numbers (K,), checked. Raises InputError when it is no delay."""
     where = "braking.driver.reaction"
-    found = asked(reaction, where, lambda: np.asarray(reaction.delays(uniform), dtype=float))
-    if found.shape != uniform.shape:
-        raise wrong(reaction, where, f"delays(uniform): expected shape {uniform.shape}, found {found.shape}", "delays")
-    none = ~((found >= 0) & np.isfinite(found))
-    if none.any():
-        raise wrong(reaction, where, f"delays(uniform): expected seconds ≥ 0, found {found[none][0]}", "delays")
-    return found
+    return numbers_of(
+        reaction, where, "delays(uniform)", lambda: reaction.delays(uniform), uniform.shape, "seconds ≥ 0"
+    )
 
 
 _TRIED = np.array([0.01, 0.1, 0.5, 0.9, 0.99])
@@ -188,13 +184,7 @@ def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
         given = asked(reaction, where, lambda: reaction.survival(of_s))
         if given is None:
             return None
-        found = asked(reaction, where, lambda: np.asarray(given, dtype=float))
-        if found.shape != of_s.shape:
-            raise wrong(reaction, where, f"{what}: expected shape {of_s.shape}, found {found.shape}", "survival")
-        none = ~((found >= 0) & (found <= 1))
-        if none.any():
-            raise wrong(reaction, where, f"{what}: expected probabilities 0 … 1, found {found[none][0]}", "survival")
-        return found
+        return numbers_of(reaction, where, what, lambda: given, of_s.shape, "probabilities 0 … 1", 1.0)
 
     found = survival(delay_s)
     if found is None:
@@ -218,12 +208,7 @@ def survival_of(reaction: Reaction, delay_s: Float) -> Float | None:
 def deceleration_of(driver: Driver, elapsed_s: Float, speed_mps: Float) -> Float:
     """(R, T) what a driver model says of `elapsed_s (R, T)` and `speed_mps (R, 1)`, checked. Raises InputError."""
     where = "braking.driver"
-    found = asked(driver, where, lambda: np.asarray(driver.deceleration_mps2(elapsed_s, speed_mps), dtype=float))
-    method = "deceleration_mps2"
-    what = f"{method}(elapsed_s, speed_mps)"
-    if found.shape != elapsed_s.shape:
-        raise wrong(driver, where, f"{what}: expected shape {elapsed_s.shape}, found {found.shape}", method)
-    none = ~((found >= 0) & np.isfinite(found))
-    if none.any():
-        raise wrong(driver, where, f"{what}: expected m/s² ≥ 0, found {found[none][0]}", method)
-    return found
+    return numbers_of(
+        driver, where, "deceleration_mps2(elapsed_s, speed_mps)",
+        lambda: driver.deceleration_mps2(elapsed_s, speed_mps), elapsed_s.shape, "m/s² ≥ 0",
+    )  # fmt: skip

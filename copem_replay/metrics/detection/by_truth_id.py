@@ -11,7 +11,6 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
@@ -27,8 +26,7 @@ if TYPE_CHECKING:
 _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
-@dataclass(frozen=True)
-class Detections:
+class Detections(NamedTuple):
     """When each episode of Episodes ended in a detection, run by run. All (S, M), NaN and −1 where not detected."""
 
     detection_s: Float
@@ -67,8 +65,7 @@ def detect(
         heard.frame_ix,
     )  # fmt: skip
     stays = _Stays(order, bounds, not_before_s, found.ended_s + _TOLERANCE_S)
-    found_at = _Out(out.detection_s, out.captured_s, out.first_unit_ix)
-    _first(rows, heard.frame_unit_ix, stays, confirm.hits, confirm.of, found_at)
+    _first(rows, heard.frame_unit_ix, stays, confirm.hits, confirm.of, out)
     return out
 
 
@@ -159,15 +156,8 @@ class _Stays(NamedTuple):
     until_s: Float
 
 
-class _Out(NamedTuple):
-    # (S, M), written where an object is detected.
-    detection_s: Float
-    newest_s: Float
-    first_unit_ix: Int
-
-
 @nb.njit(cache=True, nogil=True)
-def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, out: _Out) -> None:
+def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, out: Detections) -> None:
     valid, arrives_s, captured_s, outdated_s, unit_ix, cluster, frame_ix = rows
     order, bounds, not_before_s, until_s = stays
     detection_s, newest_s, first_unit_ix = out

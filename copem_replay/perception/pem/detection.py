@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from copem_replay.core.components import Component, NotNegative, Share, asked, wrong
+from copem_replay.core.components import Component, NotNegative, Share, numbers_of
 from copem_replay.core.grid import bilinear, check_grid
 from copem_replay.core.tracks import Float
 from copem_replay.core.view_geometry import ViewGeometry
@@ -32,14 +32,8 @@ class DetectionModel(Component, ABC):
 
 def probability_of(model: DetectionModel, view: ViewGeometry, where: str) -> Float:
     """(P,) what a model says, checked. Raises InputError, naming `where` it stands, when it is no probability."""
-    found = asked(model, where, lambda: np.asarray(model.probability(view), dtype=float))
-    expected = (len(view.range_m),)
-    if found.shape != expected:
-        raise wrong(model, where, f"probability(view): expected shape {expected}, found {found.shape}", "probability")
-    beyond = ~((found >= 0) & (found <= 1 + 1e-12))
-    if beyond.any():
-        raise wrong(model, where, f"probability(view): expected 0 … 1, found {found[beyond][0]}", "probability")
-    return found
+    shape = (len(view.range_m),)
+    return numbers_of(model, where, "probability(view)", lambda: model.probability(view), shape, "0 … 1", 1 + 1e-12)
 
 
 class VisibleShare(DetectionModel):
