@@ -111,11 +111,12 @@ def _differences(folder: Path, out: Path) -> None:
 
 def _drawn(folder: Path) -> Picture:
     """The figure of single runs of `copem-replay plot`."""
+    from copem_replay.report.figures.selection import Selection
     from copem_replay.report.figures.single_runs import runs_figure
     from copem_replay.results.read import load_results
 
     content = io.BytesIO()
-    runs_figure(load_results(folder)).savefig(content, format="png", dpi=130)
+    runs_figure(load_results(folder), Selection()).savefig(content, format="png", dpi=130)
     return Image.open(content)
 
 

@@ -16,6 +16,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.metrics.episodes import episodes
 from copem_replay.metrics.onset import ONSETS, Onset, OnsetView, Requires
 from copem_replay.perception.visibility import NO_STATICS
+from copem_replay.report.figures.selection import Selection
 from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.html.page import page
 from copem_replay.report.html.study import load_study
@@ -95,7 +96,7 @@ def test_an_own_onset_is_in_detections_report_and_figure(tmp_path: Path) -> None
     assert not table["onset_at_start"].any()
     words = Page(page(load_study(folder))).words
     assert "The clock of an object starts when it is in the lane, 20 m from the ego." in words
-    figure = runs_figure(load_results(folder), configurations=["late"])
+    figure = runs_figure(load_results(folder), Selection(["late"]))
     assert any("pedestrian in lane" in text.get_text() for axes in figure.axes for text in axes.texts)
 
 

@@ -262,7 +262,7 @@ class TestWhichObject:
 
     def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results) -> None:
         """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
-        assert choose(two).object_id == "2"
+        assert choose(two, Selection()).object_id == "2"
         without = Results(two.folder, two.seen, two.provenance)
         table = two.table.drop(columns="conflict")
         run = int(table.loc[table["configuration"] == "half"].sort_values("time_to_detection_s")["run"].iloc[-1])
@@ -270,7 +270,7 @@ class TestWhichObject:
         late_s = of_run["time_to_detection_s"].fillna(of_run["ended_s"] - of_run["onset_s"])
         spread = late_s.groupby(of_run["object_id"]).agg(lambda s: s.max() - s.min())
         without.__dict__["table"] = table
-        chosen = choose(without, run=run)
+        chosen = choose(without, Selection(run=run))
         assert spread[chosen.object_id] == spread.max()
         assert len(chosen.configurations) == 4
         assert (chosen.configurations[0], chosen.configurations[-1]) == ("never", "GT")

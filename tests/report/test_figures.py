@@ -37,7 +37,7 @@ from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, distances_figure, spread
 from copem_replay.report.figures.label_layout import last_instant
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
-from copem_replay.report.figures.selection import choose
+from copem_replay.report.figures.selection import Selection, choose
 from copem_replay.report.figures.single_runs import runs_figure
 from copem_replay.report.figures.style import appearances
 from copem_replay.report.figures.sweeps import sweeps_figure
@@ -179,10 +179,10 @@ class TestCommand:
         assert not list(mine.glob(".*"))
 
     def test_the_same_bytes_twice(self, results: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        first, _ = write_figures(results, tmp_path / "a" / "deep")
+        first, _ = write_figures(results, tmp_path / "a" / "deep", Selection())
         monkeypatch.setitem(matplotlib.rcParams, "font.size", 20.0)  # whatever the user likes
         monkeypatch.setenv("SOURCE_DATE_EPOCH", "1")
-        second, _ = write_figures(load_results(results.folder), tmp_path / "b")
+        second, _ = write_figures(load_results(results.folder), tmp_path / "b", Selection())
         assert len(first) == 2 * len(NAMES)
         assert {p.name: p.read_bytes() for p in first} == {p.name: p.read_bytes() for p in second}
         for path in first:
@@ -331,14 +331,14 @@ class TestCommand:
 class TestRuns:
     def test_from_worst_to_best(self, results: Results) -> None:
         # hit, near and never do not pass; of them who never knows is worst, then who knows last.
-        choice = choose(results)
+        choice = choose(results, Selection())
         assert (choice.log, choice.object_id, choice.run) == ("drive", "2", 0)
         assert choice.configurations == ("never", "hit", "late", "GT")
-        assert choose(results, configurations=["hit", "GT", "hit"]).configurations == ("hit", "GT")
-        assert choose(results, object_id="3", run=2).object_id == "3"
+        assert choose(results, Selection(["hit", "GT", "hit"])).configurations == ("hit", "GT")
+        assert choose(results, Selection(object_id="3", run=2)).object_id == "3"
 
     def test_courses_and_events(self, results: Results) -> None:
-        figure = runs_figure(results, configurations=["GT", "near", "hit", "never"], run=1)
+        figure = runs_figure(results, Selection(["GT", "near", "hit", "never"], run=1))
         columns = np.array(figure.axes).reshape(3, 4).T
         titles = [column[0].get_title(loc="left") for column in columns]
         assert titles == [
@@ -374,7 +374,7 @@ class TestRuns:
 
     def test_without_a_conflict(self, results: Results) -> None:
         """The other stands 30 m aside and nothing brakes."""
-        figure = runs_figure(results, object_id="3", configurations=["late", "never"])
+        figure = runs_figure(results, Selection(["late", "never"], object_id="3"))
         late, never = np.array(figure.axes).reshape(3, 2).T
         speed, gap, share = late
         titles = [column[0].get_title(loc="left") for column in (late, never)]
@@ -395,7 +395,7 @@ class TestRuns:
         text = "\n".join(
             row for row in text.splitlines() if not row.startswith("  ") or "probab" in row or "on: ego" in row
         )
-        figure = runs_figure(load_results(replayed(tmp_path, text)))
+        figure = runs_figure(load_results(replayed(tmp_path, text)), Selection())
         titles = [axes.get_title(loc="left") for axes in figure.axes[:2]]
         assert titles == ["PEM\nknown after 0 s", "GT\nknown after 0 s"]
         assert "declared driver" not in note(figure)
@@ -408,7 +408,7 @@ class TestRuns:
 
     def test_no_ego_unit(self, results: Results, mine: Path) -> None:
         text = (mine.parent / "e.yaml").read_text().replace("on: ego", "at: [0, 0]")
-        figure = runs_figure(load_results(replayed(mine.parent, text, "fixed")))
+        figure = runs_figure(load_results(replayed(mine.parent, text, "fixed")), Selection())
         assert figure.axes[-1].texts[0].get_text() == "the ego carries no unit"
 
 
@@ -675,7 +675,7 @@ class TestWords:
     def test_odd_names_are_drawn_as_they_are(self, tmp_path: Path) -> None:
         text = changed("runs: 1").replace("  late:", '  "$a$_{<&>}":').replace("  hit:", '  "_試":')
         results = load_results(replayed(tmp_path, text))
-        files, notes = write_figures(results)
+        files, notes = write_figures(results, None, Selection())
         assert (len(files), notes) == (2 * len(NAMES), [])
         labels = [text.get_text() for text in curves_figure(results).legends[0].get_texts()]
         assert labels == ["GT", "$a$_{<&>}", "near", "_試", "never"]

@@ -529,7 +529,7 @@ class TestFigures:
 
     def test_they_are_those_of_plot(self, made: Path, html: str, tmp_path: Path) -> None:
         """Shape by shape: the paths of each SVG file, in their order, are in the page."""
-        files, _ = write_figures(load_results(made), tmp_path)
+        files, _ = write_figures(load_results(made), tmp_path, Selection())
         shapes = re.findall(r' d="([^"]*)"', html)
         for name in ("curves", "distances", "latency_breakdown"):
             (file,) = (file for file in files if file.name == f"{name}.svg")
@@ -550,7 +550,7 @@ class TestFigures:
         about = ("Of each configuration a bar.",)
         own = FigureKind("How many", "a bar per configuration", rows, about=lambda results: about)
         monkeypatch.setitem(FIGURES, "how_many", own)
-        files, notes = write_figures(load_results(mine), tmp_path / "figures")
+        files, notes = write_figures(load_results(mine), tmp_path / "figures", Selection())
         assert [file.name for file in files[-2:]] == ["how_many.png", "how_many.svg"]
         assert notes == []
         found = Page(page(load_study(mine)))
@@ -558,7 +558,7 @@ class TestFigures:
         assert "How many\nOf each configuration a bar.\n" in found.words
         monkeypatch.setitem(FIGURES, "how_many", replace(own, missing=lambda results, of: "there are none"))
         assert "No figure: there are none." in Page(page(load_study(mine))).words
-        _, notes = write_figures(load_results(mine), tmp_path / "figures")
+        _, notes = write_figures(load_results(mine), tmp_path / "figures", Selection())
         assert notes == ["no figure of how_many: there are none"]
         assert not list((tmp_path / "figures").glob("how_many*"))
 

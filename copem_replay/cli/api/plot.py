@@ -58,9 +58,10 @@ def single_runs(
     >>> len(cr.plot.single_runs("out/tc016d", run=0).axes) > 0
     True
     """
+    from copem_replay.report.figures.selection import Selection
     from copem_replay.report.figures.single_runs import runs_figure
 
-    return runs_figure(results_of(results), configurations=configurations, log=log, object_id=object_id, run=run)
+    return runs_figure(results_of(results), Selection(configurations, log, object_id, run))
 
 
 def sweeps(results: AnyResults, *, configurations: Sequence[str] | None = None) -> Figure:
@@ -94,13 +95,8 @@ def write_figures(
     >>> sorted({file.stem for file in files})
     ['answer', 'curves', 'differences', 'distances', 'latency_breakdown', 'runs']
     """
+    from copem_replay.report.figures.selection import Selection
     from copem_replay.report.figures.write import write_figures as write
 
-    return write(
-        results_of(results),
-        None if folder is None else Path(folder),
-        configurations=configurations,
-        log=log,
-        object_id=object_id,
-        run=run,
-    )
+    selection = Selection(configurations, log, object_id, run)
+    return write(results_of(results), None if folder is None else Path(folder), selection)

@@ -4,6 +4,7 @@ They are the rows of `FIGURES` (`registry.py`); `write.py` makes the files. Noth
 figure is asked for, and pyplot never is.
 """
 
-from copem_replay.report.figures.registry import FIGURES, FigureKind, Selection
+from copem_replay.report.figures.registry import FIGURES, FigureKind
+from copem_replay.report.figures.selection import Selection
 
 __all__ = ["FIGURES", "FigureKind", "Selection"]

@@ -14,28 +14,14 @@ from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure, no_differences
 from copem_replay.report.figures.distances import distances_about, distances_figure
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure, no_stages
+from copem_replay.report.figures.selection import Selection
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.trade_off import no_trade_off, trade_off_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
-
-
-@dataclass(frozen=True)
-class Selection:
-    """What is drawn. None: all configurations; of log, object and run the ones that tell most (`choose`).
-
-    `differences`: to a baseline, where they are known already; None: to the default baseline.
-    """
-
-    configurations: tuple[str, ...] | None = None
-    log: str | None = None
-    object_id: str | None = None
-    run: int | None = None
-    differences: Comparison | None = None
 
 
 def _nothing_missing(results: Results, selection: Selection) -> str | None:
@@ -62,7 +48,7 @@ class FigureKind:
 def _runs(results: Results, of: Selection) -> Figure:
     from copem_replay.report.figures.single_runs import runs_figure  # with all that replays a run
 
-    return runs_figure(results, configurations=of.configurations, log=of.log, object_id=of.object_id, run=of.run)
+    return runs_figure(results, of)
 
 
 def _no_differences(results: Results, selection: Selection) -> str | None:

@@ -14,6 +14,7 @@ from copem_replay.report.figures.captions import short_names
 from copem_replay.report.figures.contenders import soonest_first, truths
 
 if TYPE_CHECKING:
+    from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
 
 _COLUMNS = 4
@@ -22,6 +23,20 @@ MOST_LINES = 12
 """Configurations in one plot, at most (chosen: more cannot be told apart)."""
 _NAMED = 12
 """Ids named in an error (chosen)."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is drawn. None: all configurations; of log, object and run the ones that tell most (`choose`).
+
+    `differences`: to a baseline, where they are known already; None: to the default baseline.
+    """
+
+    configurations: Sequence[str] | None = None
+    log: str | None = None
+    object_id: str | None = None
+    run: int | None = None
+    differences: Comparison | None = None
 
 
 @dataclass(frozen=True)
@@ -35,36 +50,29 @@ class Choice:
     named: bool
 
 
-def choose(
-    results: Results,
-    *,
-    configurations: Sequence[str] | None = None,
-    log: str | None = None,
-    object_id: str | None = None,
-    run: int | None = None,
-) -> Choice:
+def choose(results: Results, of: Selection) -> Choice:
     """What was asked for; by default the object that tells most (`most_telling`) and the run that is in the .rrd, else
     the first; four configurations from worst to best.
 
     Raises InputError for what is not among the results.
     """
     rows, where = results.table, f"{results.folder}"
-    for key, column, wanted in (("log", "log", log), ("object", "object_id", object_id)):
+    for key, column, wanted in (("log", "log", of.log), ("object", "object_id", of.object_id)):
         if wanted is not None:
             known = list(dict.fromkeys(rows[column]))
             rows = rows[rows[column] == wanted]
             if not len(rows):
                 there = ", ".join(map(str, known[:_NAMED])) + (", …" if len(known) > _NAMED else "")
                 raise InputError(f"{where}: {key}: expected one of {there}; found {wanted!r}")
-    named = results.chosen(configurations)
-    of_run = rows[rows["run"] == (_run_shown(results, rows) if run is None else run)]
+    named = results.chosen(of.configurations)
+    of_run = rows[rows["run"] == (_run_shown(results, rows) if of.run is None else of.run)]
     if not len(of_run):
-        raise InputError(f"{where}: run: expected {rows['run'].min()} to {rows['run'].max()}, found {run}")
+        raise InputError(f"{where}: run: expected {rows['run'].min()} to {rows['run'].max()}, found {of.run}")
     log, object_id = most_telling(of_run, truths(results))
     rows = rows[(rows["log"] == log) & (rows["object_id"] == object_id)]
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
-    shown = named if configurations else worst_to_best(rows, named)
-    return Choice(log, object_id, run, shown, bool(configurations))
+    shown = named if of.configurations else worst_to_best(rows, named)
+    return Choice(log, object_id, run, shown, bool(of.configurations))
 
 
 def _run_shown(results: Results, rows: pd.DataFrame) -> pd.Series:

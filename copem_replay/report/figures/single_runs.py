@@ -16,7 +16,7 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.visibility_curves import BY_EGO, share_curves
 from copem_replay.report.figures.captions import list_rates, short_names
 from copem_replay.report.figures.label_layout import STEP_IN, draw_labels, last_instant, mark
-from copem_replay.report.figures.selection import Choice, choose, left_out
+from copem_replay.report.figures.selection import Choice, Selection, choose, left_out
 from copem_replay.report.figures.style import FAINT, INK, Appearance, add_note, appearances, new_figure, style
 from copem_replay.report.figures.timeline import Story, row_of, story
 from copem_replay.report.figures.trajectories import braked_course, free_course
@@ -36,19 +36,12 @@ _BEFORE, _AFTER = 0.12, 0.15
 _LABELS = ("Speed of\nthe ego (m/s)", "Distance between\nthe boxes (m)", "Visible share\nfrom the ego")
 
 
-def runs_figure(
-    results: Results,
-    *,
-    configurations: Sequence[str] | None = None,
-    log: str | None = None,
-    object_id: str | None = None,
-    run: int | None = None,
-) -> Figure:
+def runs_figure(results: Results, of: Selection) -> Figure:
     """Speed of the ego, distance and visible share of one object in one run, a column per configuration.
 
     Raises InputError for what is not among the results, RecordingError where the log is missing or has changed.
     """
-    choice = choose(results, configurations=configurations, log=log, object_id=object_id, run=run)
+    choice = choose(results, of)
     replay = reread(results, choice.log, choice.object_id)
     rows = [row_of(results.table, choice.log, choice.object_id, choice.run, name) for name in choice.configurations]
     stories = [story(replay, results.experiment, row) for row in rows]

@@ -2,39 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.files import atomic_files
-from copem_replay.report.figures.registry import FIGURES, Selection
+from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.render import METADATA, rendered
-from copem_replay.report.figures.selection import choose
+from copem_replay.report.figures.selection import Selection, choose
 from copem_replay.results.belongings import check_still
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
 
 
-def write_figures(
-    results: Results,
-    folder: Path | None = None,
-    *,
-    configurations: Sequence[str] | None = None,
-    log: str | None = None,
-    object_id: str | None = None,
-    run: int | None = None,
-) -> tuple[list[Path], list[str]]:
+def write_figures(results: Results, folder: Path | None, selection: Selection) -> tuple[list[Path], list[str]]:
     """Write all figures of a results folder into `folder`, by default its `figures`.
 
-    `log`, `object_id` and `run` choose what the runs are of. Returns the files, and what has to be said: a figure that
-    cannot be made is left out. Figures of ours that are there already are replaced, and go where they can no longer be
-    made. Raises InputError for what is not among the results, OutputError where nothing can be written.
+    Returns the files, and what has to be said: a figure that cannot be made is left out. Figures of ours that are there
+    already are replaced, and go where they can no longer be made. Raises InputError for what is not among the results,
+    OutputError where nothing can be written.
     """
-    names = results.chosen(configurations) if configurations else None
-    choose(results, configurations=names, log=log, object_id=object_id, run=run)  # refused before anything is drawn
-    selection = Selection(names, log, object_id, run)
+    choose(results, selection)  # refused before anything is drawn
     folder = results.folder / "figures" if folder is None else folder
     notes: list[str] = []
     files: list[str] = []

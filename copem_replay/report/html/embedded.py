@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from copem_replay.report.figures.registry import FigureKind, Selection
+from copem_replay.report.figures.registry import FigureKind
 from copem_replay.report.figures.render import rendered
+from copem_replay.report.figures.selection import Selection
 from copem_replay.report.html.greys import as_variables
 from copem_replay.report.html.markup import Html, tag
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from copem_replay.report.figures.registry import FIGURES, Selection
+from copem_replay.report.figures.registry import FIGURES
+from copem_replay.report.figures.selection import Selection
 from copem_replay.report.html.conclusions import lead, more
 from copem_replay.report.html.embedded import embedded
 from copem_replay.report.html.latency_breakdown import stage_table
