@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from copem_replay.io.encodings.columns import level_of, levels_to
@@ -48,45 +47,36 @@ _FLAT = {
 _DAY_NS = 86_400 * 10**9
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """`read:` without its topic, as data; which needed keys nothing was found for; for some keys what else there is."""
-
-    read: dict[str, Any]
-    missing: tuple[str, ...]
-    others: dict[str, tuple[str, ...]]
-
-
 def propose(
     offers: Mapping[str, str], stamped: Mapping[str, Sequence[str]], log_time_ns: Sequence[int]
-) -> Proposal | None:
-    """The likeliest fields; None where no list has anything of an object.
+) -> tuple[dict[str, Any], list[str]] | None:
+    """The likeliest fields, `read:` without its topic, and needed keys nothing was found for.
+
+    None where no list has anything of an object.
 
     `stamped`: of paths that may be time stamps the words of the messages logged at `log_time_ns`, for their units.
     """
-    best: tuple[tuple[int, int, int], Proposal] | None = None
+    best: tuple[tuple[int, int, int], dict[str, Any], list[str]] | None = None
     for level in levels_to(offers):
         if not level:
             continue
         inside = {path[len(level) + 1 :]: what for path, what in offers.items() if path.startswith(f"{level}.")}
-        found = {key: choices for key, choices in _of_object(inside) if choices}
-        missing = tuple(key for key in NEEDED if key not in found)
+        found = {key: choices[0] for key, choices in _of_object(inside) if choices}
+        missing = [key for key in NEEDED if key not in found]
         if {"x_m", "y_m"} & {*missing} or len(missing) > 3:
             continue
-        read = {"objects": level, **{key: choices[0] for key, choices in found.items()}}
-        others = {key: tuple(map(str, choices[1:])) for key, choices in found.items() if len(choices) > 1}
         rank = (-len(missing), len(found), -level.count("[]"))
         if best is None or rank > best[0]:
-            best = rank, Proposal(read, missing, others)
+            best = rank, {"objects": level, **found}, missing
     if best is None:
         return None
-    chosen = best[1]
-    head = {"objects": chosen.read["objects"]}
+    _, read, missing = best
+    head = {"objects": read["objects"]}
     if (stamp := _stamp(offers, stamped, log_time_ns)) is not None:
         head["stamp"] = stamp
     if (frame := next((p for p in _FRAMES if offers.get(p) == "text"), None)) is not None:
         head["frame"] = frame
-    return Proposal(head | chosen.read, chosen.missing, chosen.others)
+    return head | read, missing
 
 
 def stamp_paths(offers: Collection[str]) -> list[str]:

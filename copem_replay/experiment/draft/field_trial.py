@@ -16,7 +16,7 @@ from copem_replay.io.encodings.columns import take_apart
 from copem_replay.io.encodings.definition import definition_of
 from copem_replay.io.encodings.raw_values import DefinitionError
 from copem_replay.io.log import BrokenIndexError, Log
-from copem_replay.io.recording import Recording, foreign, read_log
+from copem_replay.io.recording import Recording, foreign, read
 from copem_replay.io.schemas.description import Fields
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list
@@ -42,7 +42,7 @@ def proposals(log: Log, name: str) -> Iterator[tuple[ProposalFound, Recording | 
         recording, problem = None, None
         if not found.missing:
             try:
-                recording = read_log(log, name=name, topic=channel.topic, fields=fields_of(found))
+                recording = read(log, name=name, topic=channel.topic, fields=fields_of(found))
             except RecordingError as error:
                 problem = "; ".join(error.within(log.path))
             except BrokenIndexError as error:
@@ -71,8 +71,7 @@ def _proposed(log: Log, channel: Channel) -> ProposalFound | None:
     return ProposalFound(
         topic=channel.topic,
         schema=channel.schema,
-        read={"topic": channel.topic, **found.read},
-        missing=list(found.missing),
-        others={key: list(paths) for key, paths in found.others.items()},
+        read={"topic": channel.topic, **found[0]},
+        missing=found[1],
         offers=list(offers)[:_OFFERS],
     )

@@ -101,16 +101,14 @@ class TruthFound:
 class ProposalFound:
     """A channel that looks like a list of objects, by the names of its fields.
 
-    `read`: as an experiment has it, of what was found. `missing`: needed keys that were not found. `others`: for some
-    keys what else could be meant. `offers`: fields of the messages. `problem`: why it was not read. `truth`: what is
-    read so, None where not all was found.
+    `read`: as an experiment has it, of what was found. `missing`: needed keys that were not found. `offers`: fields of
+    the messages. `problem`: why it was not read. `truth`: what is read so, None where not all was found.
     """
 
     topic: str
     schema: str
     read: dict[str, Any]
     missing: list[str]
-    others: dict[str, list[str]]
     offers: list[str]
     problem: str | None = None
     truth: TruthFound | None = None

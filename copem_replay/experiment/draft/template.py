@@ -77,14 +77,10 @@ def unfinished(survey: Survey) -> str:
 
 
 def read_block(proposal: ProposalFound) -> list[str]:
-    """`read:` as it was proposed, each key with what else it could be."""
-    read, others = proposal.read, proposal.others
+    """`read:` as it was proposed."""
     lines = ["read:   # proposed from the names of its fields: look at each"]
-    for key, value in read.items():
-        line = f"  {key}: {flow(value)}"
-        said = [f"or {_plain(', '.join(others[key][:_OTHERS]))}"] if key in others else []
-        said += [_ON_KEYS[key]] if key in _ON_KEYS else []
-        lines.append(line + (f"   # {'; '.join(said)}" if said else ""))
+    for key, value in proposal.read.items():
+        lines.append(f"  {key}: {flow(value)}" + (f"   # {_ON_KEYS[key]}" if key in _ON_KEYS else ""))
     lines += [f"  # {key}: …   # needed, and not found: {_NEEDED.get(key, 'a path')}" for key in proposal.missing]
     return lines
 
