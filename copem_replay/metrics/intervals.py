@@ -8,8 +8,7 @@ the clusters' names: all configurations and metrics resample the same clusters, 
 numbers of rows (Kish's effective size), and k = share · n. A cluster is no more extreme than all or nothing, so the
 limits are wide enough for whatever is in between; percentiles see no spread where all clusters are alike.
 
-Letters of the shapes: R resamples, K clusters. Every function raises ValueError when shapes or values are not as said:
-that is a defect of the caller.
+Letters of the shapes: R resamples, K clusters.
 """
 
 from __future__ import annotations
@@ -83,8 +82,6 @@ def resamples(names: Sequence[str], seed: int, number: int = RESAMPLES) -> Resam
 @cache
 def every_resample(clusters: int) -> Resamples:
     """All resamples of K clusters that differ, the order of drawing aside; `times` add up to K^K."""
-    if not 0 < clusters < DRAWN_FROM:
-        raise ValueError(f"every_resample: expected 1 to {DRAWN_FROM - 1} clusters, found {clusters}")
     numbers = np.arange(clusters)
     drawn = np.array(list(combinations_with_replacement(range(clusters), clusters)))
     count = (drawn[:, :, None] == numbers).sum(axis=1).astype(np.uint32)
@@ -95,12 +92,7 @@ def every_resample(clusters: int) -> Resamples:
 
 
 def multiplicities(uniform: Float) -> Counts:
-    """(R, K) how often each cluster is drawn: of `uniform (R, K)`, between 0 and 1, u draws cluster ⌊u·K⌋.
-
-    Raises ValueError for other numbers, or no cluster.
-    """
-    if uniform.ndim != 2 or uniform.shape[1] == 0 or not ((uniform > 0) & (uniform < 1)).all():
-        raise ValueError("multiplicities: expected (R, K) numbers between 0 and 1, ends excluded, and a cluster")
+    """(R, K) how often each cluster is drawn: of `uniform (R, K)`, between 0 and 1, u draws cluster ⌊u·K⌋."""
     R, K = uniform.shape
     drawn = (uniform * K).astype(np.int64) + K * np.arange(R)[:, None]
     return np.bincount(drawn.ravel(), minlength=uniform.size).reshape(R, K).astype(np.uint32)
@@ -115,13 +107,9 @@ def percentile_limits(values: Float, resampled: Resamples, *, confidence: float 
     NaN among them had nothing to give and are left out; both limits are NaN where nothing is left. An infinite limit,
     or NaN between −∞ and ∞, says that there is none.
 
-    Raises ValueError for `confidence` outside (0, 1), or another number of resamples.
-
     Source: B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9 (1981) 139–158
     (percentile method).
     """
-    if values.shape != resampled.times.shape:
-        raise ValueError(f"percentile_limits: expected {resampled.times.shape} figures, found {values.shape}")
     tail = expanded_tail(confidence, resampled.count.shape[1])
     known = ~np.isnan(values)
     if not known.any():
@@ -148,18 +136,15 @@ def expanded_tail(confidence: float, clusters: int) -> float:
 
     A resample of K clusters varies less than K fresh ones would, by √((K − 1)/K), and its quantiles are normal ones
     where Student's are due: with 5 clusters plain percentiles hold the truth 86 times of 100, not 95. The level is
-    Φ(−t·√(K/(K − 1))), t the two-sided quantile of Student's distribution with K − 1 degrees of freedom.
-
-    Raises ValueError for `confidence` outside (0, 1), `clusters` < 1; with one cluster nothing varies, the plain level.
+    Φ(−t·√(K/(K − 1))), t the two-sided quantile of Student's distribution with K − 1 degrees of freedom. With one
+    cluster nothing varies: the plain level.
 
     Source: T. C. Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69 (2015) 371–386
     (expanded percentile interval).
     """
     from scipy.special import ndtr, stdtrit
 
-    tail = tail_of(confidence)
-    if clusters < 1:
-        raise ValueError(f"expected at least one cluster, found {clusters}")
+    tail = (1.0 - confidence) / 2
     if clusters == 1:
         return tail
     return float(ndtr(stdtrit(clusters - 1, tail) * math.sqrt(clusters / (clusters - 1))))
@@ -171,31 +156,23 @@ def exact_limits(successes: float, n: float, *, confidence: float = 0.95) -> tup
     All p with which so few successes, and so many, have at least half of what the confidence leaves out. Neither number
     need be whole: the limits are quantiles of beta distributions, which have a value in between, too.
 
-    Raises ValueError for n < 1, `successes` outside 0 … n, `confidence` outside (0, 1).
-
     Source: C. J. Clopper, E. S. Pearson, "The use of confidence or fiducial limits illustrated in the case of the
     binomial", Biometrika 26 (1934) 404–413.
     """
     from scipy.special import betaincinv
 
-    if not n >= 1 or not -_ROUNDING <= successes <= n + _ROUNDING:
-        raise ValueError(f"exact_limits: expected 0 <= successes <= n and n >= 1, found {successes} of {n}")
-    tail, failures = tail_of(confidence), n - successes
+    tail, failures = (1.0 - confidence) / 2, n - successes
     low = 0.0 if successes <= _ROUNDING else float(betaincinv(successes, max(failures, 0.0) + 1.0, tail))
     high = 1.0 if failures <= _ROUNDING else float(betaincinv(max(successes, 0.0) + 1.0, failures, 1.0 - tail))
     return low, high
 
 
 def effective_number(weights: Float | Int) -> float:
-    """As how many equal clusters these count, of weights (K,) ≥ 0: (Σw)²/Σw², from 1 to K.
-
-    Raises ValueError without a weight above 0.
+    """As how many equal clusters these count, of weights (K,) ≥ 0, one of them above: (Σw)²/Σw², from 1 to K.
 
     Source: L. Kish, "Survey Sampling", Wiley 1965, section 11.2.
     """
     weights = np.asarray(weights, dtype=float)
-    if not (weights >= 0).all() or not weights.sum() > 0:
-        raise ValueError("effective_number: expected weights of at least 0, and one above")
     return float(weights.sum() ** 2 / (weights @ weights))
 
 
@@ -206,59 +183,44 @@ def bootstrap_share(
 
     `successes (K,)` of `totals (K,)` in each cluster, 0 ≤ successes ≤ totals; a total may be 0, and a resample without
     any is left out. The interval of the failures is the mirror image.
-
-    Raises ValueError for other shapes or values than said, and when no resample has a share.
     """
-    if successes.ndim != 1 or successes.shape != totals.shape or resampled.count.shape[1:] != successes.shape:
-        raise ValueError(f"bootstrap_share: expected columns of {resampled.count.shape[1]} clusters")
-    if (successes < 0).any() or (successes > totals).any():
-        raise ValueError("bootstrap_share: expected 0 <= successes <= totals in every cluster")
     sums = np.empty((len(resampled.count), 2))
     columns = np.stack([successes, totals], axis=1).astype(float)
     size = max(1, _CELLS // len(columns))
     for r in range(0, len(sums), size):
         sums[r : r + size] = resampled.count[r : r + size].astype(float) @ columns
-    if not (sums[:, 1] > 0).any():
-        raise ValueError("bootstrap_share: expected a total above 0, found none in any resample")
     with np.errstate(invalid="ignore"):  # a resample without a total has no share
         return percentile_limits(sums[:, 0] / sums[:, 1], resampled, confidence=confidence)
 
 
-def share_limits(
-    successes: Float | Int, totals: Float | Int, resampled: Resamples, *, confidence: float = 0.95
-) -> tuple[str, float, float]:
+def share_limits(successes: Float | Int, totals: Float | Int, resampled: Resamples) -> tuple[str, float, float]:
     """Bound Σ successes / Σ totals: of which kind, low, high.
 
     `bootstrap`: `bootstrap_share`, over many clusters of which enough succeed and fail; else `bootstrap+exact`: on each
     side the wider of it and the exact limits.
     """
-    limits = bootstrap_share(successes, totals, resampled, confidence=confidence)
-    share = float(successes.sum()) / float(totals.sum())
-    return widened(limits, share, effective_number(totals), confidence=confidence)
+    limits = bootstrap_share(successes, totals, resampled)
+    return widened(limits, float(successes.sum()) / float(totals.sum()), effective_number(totals))
 
 
-def widened(
-    limits: tuple[float, float], share: float, n: float, *, confidence: float = 0.95
-) -> tuple[str, float, float]:
+def widened(limits: tuple[float, float], share: float, n: float) -> tuple[str, float, float]:
     """Limits of a share over `n` clusters, nowhere narrower than the exact ones unless many succeed and many fail."""
     k = min(n * share, n)
     if min(n - EXACT_BELOW, k - FEWEST_EACH, n - k - FEWEST_EACH) >= -_ROUNDING:
         return "bootstrap", *limits
-    least, most = exact_limits(k, n, confidence=confidence)
+    least, most = exact_limits(k, n)
     return "bootstrap+exact", min(limits[0], least), max(limits[1], most)
 
 
-def alike_limits(difference: float, n: float, *, confidence: float = 0.95) -> tuple[float, float]:
+def alike_limits(difference: float, n: float) -> tuple[float, float]:
     """Bound a difference of two shares, −1 … 1, that is the same in all of `n` clusters: (low, high).
 
     Exact on each side: as if |difference| · n of n favoured the one, the rest neither; of these any number may favour
     the other that none of n leaves possible. So of five at 0 [−.522, .522], of five at 1 [.478, 1].
     """
-    if not abs(difference) <= 1 + _ROUNDING:
-        raise ValueError(f"alike_limits: expected a difference between -1 and 1, found {difference}")
     size = min(abs(difference), 1.0)
-    low, high = exact_limits(size * n, n, confidence=confidence)
-    low -= (1.0 - size) * exact_limits(0.0, n, confidence=confidence)[1]
+    low, high = exact_limits(size * n, n)
+    low -= (1.0 - size) * exact_limits(0.0, n)[1]
     return (low, high) if difference >= 0 else (-high, -low)
 
 
@@ -268,14 +230,10 @@ def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, 
     All p for which |successes/n − p| ≤ z·√(p(1 − p)/n), z the two-sided normal quantile. Low is exactly 0
     without a success, high exactly 1 without a failure.
 
-    Raises ValueError for n < 1, `successes` outside 0 … n, `confidence` outside (0, 1).
-
     Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
     J. Amer. Statist. Assoc. 22 (1927) 209–212.
     """
-    if n < 1 or not 0 <= successes <= n:
-        raise ValueError(f"wilson: expected 0 <= successes <= n and n >= 1, found {successes} of {n}")
-    z = -NormalDist().inv_cdf(tail_of(confidence))
+    z = -NormalDist().inv_cdf((1.0 - confidence) / 2)
     share, z2 = successes / n, z * z
     centre = (share + z2 / (2 * n)) / (1 + z2 / n)
     half = z * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n)) / (1 + z2 / n)
@@ -283,10 +241,3 @@ def wilson(successes: int, n: int, *, confidence: float = 0.95) -> tuple[float, 
     low = 0.0 if successes == 0 else centre - half
     high = 1.0 if successes == n else centre + half
     return low, high
-
-
-def tail_of(confidence: float) -> float:
-    """Halve what a confidence leaves out: the probability beyond each limit."""
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"expected a confidence between 0 and 1, ends excluded, found {confidence}")
-    return (1.0 - confidence) / 2

@@ -407,11 +407,6 @@ ONE = np.array([1.0])
         (lambda: quantile_with_never(ONE, np.array([True, True]), 0.5), "equal length"),
         (lambda: quantile_with_never(ONE * np.nan, np.array([True]), 0.5), "found NaN"),
         (lambda: quantile_with_never(ONE, np.array([True]), 0.0), "quantile level"),
-        (lambda: wilson(0, 0), "n >= 1"),
-        (lambda: wilson(-1, 5), "found -1 of 5"),
-        (lambda: wilson(6, 5), "found 6 of 5"),
-        (lambda: wilson(1, 5, confidence=1.0), "confidence"),
-        (lambda: wilson(1, 5, confidence=0.0), "confidence"),
     ],
 )
 def test_a_defect_of_the_caller_is_said(call: Callable[[], object], reason: str):

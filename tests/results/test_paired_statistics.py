@@ -120,8 +120,3 @@ def test_limits_among_infinite_figures_are_infinite():
     assert (low, high) == (-math.inf, 1.0)
     # Between one and the other infinity there is no number.
     assert math.isnan(limits([-math.inf, math.inf], 50, 0.5)[0])
-
-
-def test_a_confidence_of_one_is_refused():
-    with pytest.raises(ValueError, match="confidence"):
-        limits([1.0] * 3, 5, 1.0)

@@ -24,9 +24,7 @@ _CELLS = 4_000_000
 """Resamples × rows held at a time (chosen: 32 MB a column)."""
 
 
-def band(
-    time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int, *, confidence: float = 0.95
-) -> tuple[Float, Float]:
+def band(time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int) -> tuple[Float, Float]:
     """Limits (G,) of the cumulative incidence at instants (G,).
 
     `time_s (n,)`, `ending (n,)` as in `statistics.cumulative_incidence`; `cluster (n,)`: the name of each row's.
@@ -46,8 +44,8 @@ def band(
     size = max(1, _CELLS // max(len(kept), len(at_s)))
     blocks = [curves(resampled.count[k : k + size]) for k in range(0, len(resampled.count), size)]
     share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(of))
-    limits = [percentile_limits(at, resampled, confidence=confidence) for at in np.concatenate(blocks).T]
-    of_all = [widened(*one, n, confidence=confidence)[1:] for one in zip(limits, share.tolist(), strict=True)]
+    limits = [percentile_limits(at, resampled) for at in np.concatenate(blocks).T]
+    of_all = [widened(*one, n)[1:] for one in zip(limits, share.tolist(), strict=True)]
     low, high = np.array(of_all).reshape(-1, 2).T
     return low, high
 
@@ -79,7 +77,7 @@ def resampled_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> 
 
 
 def mean_limits(
-    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int, *, confidence: float = 0.95
+    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int
 ) -> tuple[float, float] | None:
     """Limits of the restricted mean of times (n,) at a horizon; None: every resample has the same mean.
 
@@ -91,7 +89,7 @@ def mean_limits(
         counted_s = np.where(ending == DETECTED, np.minimum(time_s, horizon_s), horizon_s)
         sums = np.stack([np.bincount(of, counted_s), np.bincount(of)], axis=1)
         of_all = resampled.count.astype(float) @ sums
-        return _apart(*percentile_limits(of_all[:, 0] / of_all[:, 1], resampled, confidence=confidence))
+        return _apart(*percentile_limits(of_all[:, 0] / of_all[:, 1], resampled))
     order = np.lexsort((of, ending, time_s))
     time_s, ending, of = time_s[order], ending[order], of[order]
     at_s = np.unique(time_s[(ending == DETECTED) & (time_s < horizon_s)])
@@ -102,7 +100,7 @@ def mean_limits(
         @ lengths_s
         for k in range(0, len(resampled.count), size)
     ]  # fmt: skip
-    return _apart(*percentile_limits(np.concatenate(means), resampled, confidence=confidence))
+    return _apart(*percentile_limits(np.concatenate(means), resampled))
 
 
 def _apart(low: float, high: float) -> tuple[float, float] | None:
