@@ -87,8 +87,9 @@ class Recording:
         return (self.path,) if self.together is None else self.together.paths
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
 def read(
-    path: Local | str,
+    source: Local | str | Log,
     *,
     name: str,
     ego: str | EgoTopic | None = None,
@@ -97,7 +98,7 @@ def read(
     beside: Collection[str] = (),
     window_s: WindowSeconds = None,
 ) -> Recording:
-    """Read the truth of the recording at `path`, as the log called `name`.
+    """Read the truth of the recording at a place, or of an opened log, as the log called `name`.
 
     `ego`: id of the ego vehicle, or where its poses are; None for the host vehicle the log names, else the only
     odometry's. `topic`: where the truth is, None where there is only one candidate; `fields`: and where its messages
@@ -107,23 +108,7 @@ def read(
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several; EmptyWindowError.
     """
-    place = Path(path) if isinstance(path, str) else path
-    log = open_log(place)
-    return read_log(log, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
-
-
-@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
-def read_log(
-    log: Log,
-    *,
-    name: str,
-    ego: str | EgoTopic | None = None,
-    topic: str | None = None,
-    fields: Fields | None = None,
-    beside: Collection[str] = (),
-    window_s: WindowSeconds = None,
-) -> Recording:
-    """Do the same with a log that was opened before."""
+    log = source if isinstance(source, Log) else open_log(Path(source) if isinstance(source, str) else source)
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:

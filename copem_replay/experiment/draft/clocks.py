@@ -15,7 +15,7 @@ from copem_replay.io.containers.joined import labels_of
 from copem_replay.io.log import Log
 from copem_replay.io.open import open_log
 from copem_replay.io.recorded_lists import lists_on
-from copem_replay.io.recording import read_log, truth_topics
+from copem_replay.io.recording import read, truth_topics
 from copem_replay.io.schemas.registry import known_lists
 from copem_replay.io.short_tracks import Entries, entries_of
 from copem_replay.io.time_offset import TimeOffset, time_offset
@@ -108,7 +108,7 @@ def _lists(log: Log, label: str, t0_ns: int) -> Iterator[_Lists]:
     """The object lists of a recording, truths first, in seconds since an instant. What cannot be read is none."""
     for topic in truth_topics(log):
         try:
-            truth = read_log(log, name=label, topic=topic).truth
+            truth = read(log, name=label, topic=topic).truth
         except RecordingError:
             continue
         yield _Lists(f"{label}:{topic}", entries_of(truth, t0_ns))

@@ -14,7 +14,7 @@ from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, c
 from copem_replay.experiment.draft.findings import Mast, Suggestion
 from copem_replay.io.channel import schema_name
 from copem_replay.io.log import BrokenIndexError, Log
-from copem_replay.io.recording import Recording, foreign, read_log
+from copem_replay.io.recording import Recording, foreign, read
 from copem_replay.io.schemas.pose_schemas import ODOMETRY, is_pose
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def _ego(log: Log, recording: Recording, fields: Fields | None) -> tuple[str | d
 
         try:
             asked = EgoTopic.model_validate(place)
-            again = read_log(log, name=scene.log, topic=recording.topic, fields=fields, ego=asked)
+            again = read(log, name=scene.log, topic=recording.topic, fields=fields, ego=asked)
         except (RecordingError, BrokenIndexError):
             continue
         if again.scene.ego_ix >= 0:

@@ -25,7 +25,7 @@ from copem_replay.io.channel import Channel
 from copem_replay.io.log import Log
 from copem_replay.io.open import name_of, open_log
 from copem_replay.io.plausibility import MAX_GAP_S
-from copem_replay.io.recording import Recording, choose_topic, foreign, is_truth, moving_ids, read_log, truth_topics
+from copem_replay.io.recording import Recording, choose_topic, foreign, is_truth, moving_ids, read, truth_topics
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.pose_schemas import is_pose
 from copem_replay.io.schemas.registry import is_list
@@ -64,7 +64,7 @@ def survey(place: Local | str) -> Survey:
     beside = [t.topic for t in found.topics if t.role == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=name_of(path), topic=topic, beside=beside)
+            recording = read(log, name=name_of(path), topic=topic, beside=beside)
         except RecordingError as error:
             failures.append(str(error))
             continue
