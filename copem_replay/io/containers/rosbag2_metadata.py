@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -17,9 +16,6 @@ METADATA = "metadata.yaml"
 _INFORMATION = "rosbag2_bagfile_information"
 _LONGEST_BYTES = 1 << 19
 """A longer description is none (chosen: three hundred topics and a thousand files take half of it)."""
-
-_DEEPEST = 100  # brackets within brackets (chosen: rosbag2 writes none)
-_BRACKET = re.compile(rb"[\[\]{}]")
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -59,10 +55,6 @@ def _information(folder: Path) -> Node:
         raise RecordingError(f"cannot be opened: {error.strerror}", path=place) from None
     if len(content) > _LONGEST_BYTES:
         raise RecordingError("expected the description of a rosbag2 folder, found more than 512 KiB", path=place)
-    if _depth(content) > _DEEPEST:
-        raise RecordingError(
-            "expected the description of a rosbag2 folder, found brackets nested too deeply", path=place
-        )
     try:
         root = composed(content.decode())
     except UnicodeDecodeError:
@@ -73,15 +65,6 @@ def _information(folder: Path) -> Node:
     if not isinstance(information, MappingNode):
         raise RecordingError(f"expected the description of a rosbag2 folder, found no `{_INFORMATION}`", path=place)
     return information
-
-
-def _depth(content: bytes) -> int:
-    """How many brackets are open at most: what the YAML library reads takes time with the square of them."""
-    deepest = depth = 0
-    for found in _BRACKET.finditer(content):
-        depth += 1 if found[0] in b"[{" else -1
-        deepest = max(deepest, depth)
-    return deepest
 
 
 def _names(information: Node) -> list[str]:
