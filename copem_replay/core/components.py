@@ -20,9 +20,11 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    Tag,
     ValidationError,
     WithJsonSchema,
 )
@@ -45,6 +47,13 @@ class Frozen(BaseModel):
     """Base of all models: immutable, and a key that is not known is refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=described)
+
+
+P = TypeVar("P")
+M = TypeVar("M", bound=BaseModel)
+_FORM = Discriminator(lambda value: "mapping" if isinstance(value, dict | BaseModel) else "plain")
+Either = Annotated[Annotated[P, Tag("plain")] | Annotated[M, Tag("mapping")], _FORM]
+"""Either of two; errors are about that whose form the value has."""
 
 
 class Component(Frozen):

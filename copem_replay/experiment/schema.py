@@ -13,10 +13,8 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     ConfigDict,
-    Discriminator,
     Field,
     SerializerFunctionWrapHandler,
-    Tag,
     field_validator,
     model_serializer,
     model_validator,
@@ -25,7 +23,7 @@ from pydantic import (
 from copem_replay.communication.latency import Delay
 from copem_replay.communication.link import ConstantLink, LinkModel, UnitLinks
 from copem_replay.communication.sends import Sends
-from copem_replay.core.components import Count, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
+from copem_replay.core.components import Count, Either, Frozen, Id, Latency, Number, Positive, Slot, at_key, described
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.link_keys import AnyLink, IssueRate, LinkName, LinkOf
 from copem_replay.experiment.names import ConfigurationName, UnitName
@@ -228,11 +226,7 @@ def _with_ideals(configurations: dict[str, Configuration]) -> dict[str, Configur
     return result
 
 
-def _what_log(value: object) -> str:
-    return "settings" if isinstance(value, dict | LogSettings) else "path"
-
-
-LogEntry = Annotated[Annotated[str, Tag("path")] | Annotated[LogSettings, Tag("settings")], Discriminator(_what_log)]
+LogEntry = Either[str, LogSettings]
 """A path, with wildcards or not, or a mapping with settings."""
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from copem_replay.core.components import Frozen, Id, Latency, Share
+from copem_replay.core.components import Either, Frozen, Id, Latency, Share
 from copem_replay.perception.config import Rate
 from copem_replay.perception.pem.ghosts import MeanNumber
 
@@ -52,11 +52,7 @@ class SweptBy(Frozen):
     burst_s: SweptNames | None = _UNSAID
 
 
-def _swept_by(value: object) -> str:
-    return "by" if isinstance(value, dict | SweptBy) else "names"
-
-
-Swept = Annotated[Annotated[SweptNames, Tag("names")] | Annotated[SweptBy, Tag("by")], Discriminator(_swept_by)]
+Swept = Either[SweptNames, SweptBy]
 
 
 class Sweep(Frozen):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from copem_replay.core.components import Covariance, Frozen, Id, Latency, NotNegative, Number, Positive, Share
+from copem_replay.core.components import Covariance, Either, Frozen, Id, Latency, NotNegative, Number, Positive, Share
 from copem_replay.io.schemas.object_lists import Fields
 
 
@@ -66,11 +66,7 @@ def _how_read(value: object) -> str:
 HowRead = Annotated[Annotated[Read, Tag("topic")] | Annotated[ReadFields, Tag("fields")], Discriminator(_how_read)]
 
 
-def _what_ego(value: object) -> str:
-    return "topic" if isinstance(value, dict | EgoTopic) else "id"
-
-
-Ego = Annotated[Annotated[Id, Tag("id")] | Annotated[EgoTopic, Tag("topic")], Discriminator(_what_ego)]
+Ego = Either[Id, EgoTopic]
 
 
 def _in_order(window_s: tuple[float | None, float | None]) -> tuple[float | None, float | None]:

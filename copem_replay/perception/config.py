@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Protocol, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from copem_replay.core.components import Frozen, Id, NotNegative, Number, Positive, Share
+from copem_replay.core.components import Either, Frozen, Id, NotNegative, Number, Positive, Share
 from copem_replay.perception.pem.condition import ClassNames
 from copem_replay.perception.unit_errors import Clock, Outages, PoseError
 from copem_replay.perception.visibility import VisibilityModel
@@ -41,11 +41,7 @@ class Carriers(Frozen):
     penetration_rate: Share
 
 
-def _what_carries(value: object) -> str:
-    return "carriers" if isinstance(value, dict | Carriers) else "id"
-
-
-On = Annotated[Annotated[Id, Tag("id")] | Annotated[Carriers, Tag("carriers")], Discriminator(_what_carries)]
+On = Either[Id, Carriers]
 
 
 class Placement(Frozen):

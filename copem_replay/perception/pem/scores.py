@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
-from copem_replay.core.components import Flag, Frozen, Share
+from copem_replay.core.components import Either, Flag, Frozen, Share
 from copem_replay.core.tracks import Float
 
 _NODES = (1 - np.cos(np.linspace(0, np.pi, 1025))) / 2
@@ -56,11 +56,5 @@ def _quantiles(a: float, b: float) -> Float:
     return table
 
 
-def _how(value: Any) -> str:
-    return "scores" if isinstance(value, dict | Scores) else "number"
-
-
-Claimed = Annotated[
-    Annotated[Share | Literal["visible_share"], Tag("number")] | Annotated[Scores, Tag("scores")], Discriminator(_how)
-]
+Claimed = Either[Share | Literal["visible_share"], Scores]
 """How probable a unit says that it is that there is an object: of each entry alike, as much as is seen, or drawn."""
