@@ -10,13 +10,11 @@ censor: F may stay below 1 for ever, and a quantile above its last value does no
 *Distance at detection*: far is good, so a row that was never detected ranks below every distance.
 Intervals: metrics/intervals.py.
 
-Letters of the shapes: n rows, M distinct times of detection. Every function raises ValueError
-when shapes or values are not as said, or when there are no rows at all: that is a defect of the caller.
+Letters of the shapes: n rows, M distinct times of detection.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -61,8 +59,14 @@ def cumulative_incidence(
     >>> times_s, incidence
     (array([0.5, 2. ]), array([0.5 , 0.75]))
     """
-    _rows(time_s, ending)
-    weight = _weights(time_s, weight)
+    weight = np.ones(len(time_s)) if weight is None else weight
+    for column in (ending, weight):
+        if time_s.ndim != 1 or column.shape != time_s.shape:
+            raise ValueError(f"expected two columns of equal length, found {time_s.shape} and {column.shape}")
+    if len(time_s) == 0:
+        raise ValueError("expected at least one row, found none")
+    if not (weight >= 0).all():
+        raise ValueError("expected weights of at least 0")
     if not np.isfinite(time_s).all():
         raise ValueError("cumulative_incidence: expected finite times")
     detected, censored = ending == DETECTED, ending == CENSORED
@@ -98,26 +102,12 @@ def _totals(value: Float, weight: Float) -> tuple[Float, Float]:
     return distinct, totals
 
 
-def _weights(rows: NDArray[Any], weight: Float | None) -> Float:
-    """(n,) how much each row counts."""
-    if weight is None:
-        return np.ones(len(rows))
-    _check_columns(rows, weight)
-    if not (weight >= 0).all():
-        raise ValueError("expected weights of at least 0")
-    return weight
-
-
 def quantile_time(times_s: Float, incidence: Float, q: float) -> float | None:
     """Find the smallest time at which the incidence is at least `q` (to 1e-12), seconds.
 
     None when it is never reached: the quantile falls among the never detected, or beyond what was looked at.
     `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`, M may be 0; 0 < `q` ≤ 1.
-
-    Raises ValueError for shapes that differ or another `q`.
     """
-    _check_columns(times_s, incidence)
-    _check_level(q)
     first = int(np.searchsorted(incidence, q - SHARE_TOLERANCE, side="left"))
     return float(times_s[first]) if first < len(times_s) else None
 
@@ -128,12 +118,7 @@ def restricted_mean(times_s: Float, incidence: Float, horizon_s: float) -> float
     `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`; M may be 0, the mean is then the horizon.
     With a = min(0, earliest time) it is a + ∫ₐʰ (1 − F(t)) dt. Beyond the last time at which anyone was
     looked at, F is not known, only held: a horizon there counts the last censored as never detected.
-
-    Raises ValueError for shapes that differ or a horizon that is not finite.
     """
-    _check_columns(times_s, incidence)
-    if not math.isfinite(horizon_s):
-        raise ValueError(f"restricted_mean: expected a finite horizon, found {horizon_s}")
     # F is 0 before its first step, so a drops out: what is left is h − ∫ F.
     before = times_s < horizon_s
     lengths_s = np.diff(np.append(times_s[before], horizon_s))
@@ -147,35 +132,11 @@ def quantile_with_never(values: Float, detected: Bool, q: float, weight: Float |
     below v, the never detected among them, is at least `q` (to 1e-12). So it is the value of some row.
     `values (n,)`, any unit, not read where not detected and NaN only there; `detected (n,)`; 0 < `q` ≤ 1;
     `weight (n,)`: how much each row counts, None: all alike.
-
-    Raises ValueError for no rows, for shapes that differ, for NaN where detected, for another `q`.
     """
-    _rows(values, detected)
-    weight = _weights(values, weight)
-    _check_level(q)
+    weight = np.ones(len(values)) if weight is None else weight
     known = values[detected]
-    if np.isnan(known).any():
-        raise ValueError("quantile_with_never: expected a value in every detected row, found NaN")
     order = np.argsort(known, kind="stable")
     below = np.concatenate([[weight[~detected].sum()], weight[~detected].sum() + np.cumsum(weight[detected][order])])
     place = int(np.searchsorted(below, (q - SHARE_TOLERANCE) * weight.sum(), side="left"))
     place = max(place, 0 if below[0] > 0 else 1)
     return float(known[order[min(place, len(known)) - 1]]) if place > 0 else None
-
-
-def _check_columns(first: NDArray[Any], second: NDArray[Any]) -> None:
-    if first.ndim != 1 or first.shape != second.shape:
-        raise ValueError(f"expected two columns of equal length, found {first.shape} and {second.shape}")
-
-
-def _rows(first: NDArray[Any], second: NDArray[Any]) -> int:
-    """Count the rows of two columns: at least one."""
-    _check_columns(first, second)
-    if len(first) == 0:
-        raise ValueError("expected at least one row, found none")
-    return len(first)
-
-
-def _check_level(q: float) -> None:
-    if not 0.0 < q <= 1.0:
-        raise ValueError(f"expected a quantile level 0 < q <= 1, found {q}")

@@ -397,16 +397,6 @@ ONE = np.array([1.0])
         (lambda: cumulative_incidence(np.array([np.nan]), np.array([LEFT])), "finite"),
         (lambda: cumulative_incidence(np.array([np.inf]), np.array([LEFT])), "finite"),
         (lambda: cumulative_incidence(ONE, np.array([3])), "DETECTED, LEFT or CENSORED"),
-        (lambda: quantile_time(ONE, np.array([]), 0.5), "equal length"),
-        (lambda: quantile_time(ONE, ONE, 0.0), "quantile level"),
-        (lambda: quantile_time(ONE, ONE, 1.01), "quantile level"),
-        (lambda: quantile_time(ONE, ONE, math.nan), "quantile level"),
-        (lambda: restricted_mean(ONE, np.array([]), 1.0), "equal length"),
-        (lambda: restricted_mean(ONE, ONE, math.inf), "finite horizon"),
-        (lambda: quantile_with_never(np.array([]), np.array([], dtype=bool), 0.5), "at least one row"),
-        (lambda: quantile_with_never(ONE, np.array([True, True]), 0.5), "equal length"),
-        (lambda: quantile_with_never(ONE * np.nan, np.array([True]), 0.5), "found NaN"),
-        (lambda: quantile_with_never(ONE, np.array([True]), 0.0), "quantile level"),
     ],
 )
 def test_a_defect_of_the_caller_is_said(call: Callable[[], object], reason: str):

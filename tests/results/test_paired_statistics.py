@@ -41,12 +41,6 @@ def test_each_number_draws_its_cluster():
     assert drawn.tolist() == [[1, 1, 1], [3, 0, 0], [0, 1, 2]]
 
 
-@pytest.mark.parametrize("uniform", [np.zeros((2, 0)), np.array([[0.0, 0.5]]), np.array([[0.5, 1.0]]), np.array([0.5])])
-def test_draws_of_other_numbers_are_refused(uniform):
-    with pytest.raises(ValueError, match="multiplicities"):
-        multiplicities(uniform)
-
-
 def test_sums_of_resamples_are_those_of_a_plain_loop():
     rng = np.random.default_rng(1)
     sums, count = rng.normal(size=(7, 3)), rng.integers(0, 4, (50, 7)).astype(np.uint32)
