@@ -29,6 +29,7 @@ CHUNK_LIMIT_BYTES = 1 << 28
 MOST_RECORDS = 1 << 18
 """A chunk that holds more records is taken for damage (chosen: 8 MB of the shortest messages are as many)."""
 _SMALL_BYTES = 1 << 26
+_MOST_TOO_LARGE = 2
 MOST_EXPANSION = 1000
 """A file whose chunks hold more than this many times its size, and more than 64 MiB, is taken for damaged (chosen:
 recordings of traffic have 2 to 40, of what hardly moves some hundreds)."""
@@ -70,16 +71,22 @@ def without_trace(error: BaseException) -> BaseException:
 
 
 class Allowance:
-    """How much the chunks of a file may hold in all, also those that are too large and are read in vain."""
+    """How much the chunks of a file may hold in all, and how many of them may be too large."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._left = _SMALL_BYTES + MOST_EXPANSION * os.fstat(file.fileno()).st_size
+        self._too_large = 0
 
-    def spend(self, size: int, before: int = 0) -> None:
-        """Take note of so much of a chunk, of which so much was there before. Raises ValueError when it is too much."""
+    def refuse(self) -> ValueError:
+        """Take note of a chunk that is too large, for which work was done in vain."""
+        self._too_large += 1
+        return ValueError(f"a chunk holds more than {CHUNK_LIMIT_BYTES >> 20} MiB")
+
+    def spend(self, size: int) -> None:
+        """Take note of a chunk. Raises ValueError when it is one too many."""
         self._left -= size
-        if before + size > CHUNK_LIMIT_BYTES:
-            raise ValueError(f"a chunk holds more than {CHUNK_LIMIT_BYTES >> 20} MiB")
+        if self._too_large > _MOST_TOO_LARGE:
+            raise ValueError("too many chunks are too large")
         if self._left < 0:
             raise ValueError(f"its chunks hold more than {MOST_EXPANSION} times the size of the file")
 
@@ -118,9 +125,12 @@ def in_chunk(body: bytes, allowance: Allowance) -> Iterator[McapRecord]:
     size = int.from_bytes(body[content_at - 8 : content_at], "little")
     if size > len(body) - content_at:
         raise EndOfFile()
-    allowance.spend(0, claimed)
+    allowance.spend(0)
+    if claimed > CHUNK_LIMIT_BYTES:
+        raise allowance.refuse()
     compression = body[_CHUNK_HEAD.size : content_at - 8]
     plain, whole = _decompressed(compression, memoryview(body)[content_at : content_at + size], claimed, allowance)
+    allowance.spend(len(plain))
     if not whole:
         raise EndOfFile()
     if checksum and zlib.crc32(plain) != checksum:
@@ -134,6 +144,7 @@ def in_cut_chunk(body: bytes, allowance: Allowance) -> Iterator[McapRecord]:
         _, _, claimed, _, named = _CHUNK_HEAD.unpack_from(body)
         content = memoryview(body)[_CHUNK_HEAD.size + named + 8 :]
         plain, _ = _decompressed(body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + named], content, claimed, allowance)
+        allowance.spend(len(plain))
         yield from _split(plain)
     except DAMAGE:
         return
@@ -186,17 +197,20 @@ def _decompressed(
         return _lz4(content, allowance)
     if compression:
         raise ValueError(f"a chunk is compressed as {compression[:20].decode(errors='replace')!r}, which is not read")
-    allowance.spend(len(content))
+    if len(content) > CHUNK_LIMIT_BYTES:
+        raise allowance.refuse()
     return bytes(content), True
 
 
 def _zstd(content: memoryview, claimed: int, allowance: Allowance) -> tuple[bytearray, bool]:
     plain, reader = bytearray(), zstandard.ZstdDecompressor().stream_reader(content)
     size = zstandard.frame_content_size(content)  # −1: the frame does not say
-    allowance.spend(0, size)
+    if size > CHUNK_LIMIT_BYTES:
+        raise allowance.refuse()
     while piece := reader.read(_PIECE_BYTES):
-        allowance.spend(len(piece), len(plain))
         plain += piece
+        if len(plain) > CHUNK_LIMIT_BYTES:
+            raise allowance.refuse()
     return plain, len(plain) >= (claimed if size < 0 else size)
 
 
@@ -206,8 +220,9 @@ def _lz4(content: memoryview, allowance: Allowance) -> tuple[bytearray, bool]:
     while not reader.eof:
         piece = reader.decompress(fed, max_length=_PIECE_BYTES)
         fed = b""
-        allowance.spend(len(piece), len(plain))
         plain += piece
+        if len(plain) > CHUNK_LIMIT_BYTES:
+            raise allowance.refuse()
         if not piece and reader.needs_input:
             return plain, False
     return plain, True
