@@ -13,6 +13,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -125,17 +126,8 @@ def open_trace(path: Path) -> Trace:
 
 def message_class(schema: str) -> Any:
     """The class of messages, imported when first needed."""
-    if schema == SENSOR_DATA:
-        from osi3.osi_sensordata_pb2 import SensorData
-
-        return SensorData
-    if schema == SENSOR_VIEW:
-        from osi3.osi_sensorview_pb2 import SensorView
-
-        return SensorView
-    from osi3.osi_groundtruth_pb2 import GroundTruth
-
-    return GroundTruth
+    name = schema.removeprefix("osi3.")
+    return getattr(import_module(f"osi3.osi_{name.lower()}_pb2"), name)
 
 
 def _payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:
