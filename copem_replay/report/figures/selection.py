@@ -65,7 +65,9 @@ def choose(results: Results, of: Selection) -> Choice:
                 there = ", ".join(map(str, known[:_NAMED])) + (", …" if len(known) > _NAMED else "")
                 raise InputError(f"{where}: {key}: expected one of {there}; found {wanted!r}")
     named = results.chosen(of.configurations)
-    of_run = rows[rows["run"] == (_run_shown(results, rows) if of.run is None else of.run)]
+    # Of each row the run of its log that is in the .rrd, else the first.
+    shown_run = rows["log"].map(results.provenance.run_shown).fillna(rows["run"].min()).astype(int)
+    of_run = rows[rows["run"] == (shown_run if of.run is None else of.run)]
     if not len(of_run):
         raise InputError(f"{where}: run: expected {rows['run'].min()} to {rows['run'].max()}, found {of.run}")
     log, object_id = most_telling(of_run, truths(results))
@@ -73,11 +75,6 @@ def choose(results: Results, of: Selection) -> Choice:
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
     shown = named if of.configurations else worst_to_best(rows, named)
     return Choice(log, object_id, run, shown, bool(of.configurations))
-
-
-def _run_shown(results: Results, rows: pd.DataFrame) -> pd.Series:
-    """Of each row the run of its log that is in the .rrd, else the first."""
-    return rows["log"].map(results.provenance.run_shown).fillna(rows["run"].min()).astype(int)
 
 
 def most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, str]:

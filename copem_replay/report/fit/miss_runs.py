@@ -91,10 +91,6 @@ def _longer(missed: Bool, new: Bool) -> Int:
     return out
 
 
-def _no_miss(study: FitStudy) -> str | None:
-    return f"no miss in {len(study.rows.log)} rows" if study.rows.listed.all() else None
-
-
 MISS_RUNS = FitFigure(
     "How long misses last",
     "number of runs of misses per pass over their length, recorded, fitted and without memory",
@@ -102,5 +98,5 @@ MISS_RUNS = FitFigure(
     "model: its misses last as long as the recorded ones. A model without memory has the same share of misses, but "
     "falls off too fast where misses last.",
     miss_runs_figure,
-    _no_miss,
+    lambda study: f"no miss in {len(study.rows.log)} rows" if study.rows.listed.all() else None,
 )

@@ -62,7 +62,7 @@ def summary_tables(study: Study) -> Html:
     parts = []
     for part in _parts(study.results.experiment.measure.metrics):
         there = {name: says for name, says in part.columns.items() if name in rows and rows[name].notna().any()}
-        once = [name for name in there if name in _ONCE and _alike(rows[name])]
+        once = [name for name in there if name in _ONCE and rows[name].nunique(dropna=False) == 1]
         columns = {name: there[name] for name in in_order(list(there)) if name not in once}
         wanted = part.id != "braking" or "pass_share" in columns
         if columns and wanted:
@@ -70,10 +70,6 @@ def summary_tables(study: Study) -> Html:
             parts += [_table(study, part, columns), *(tag("p", line, class_="below") for line in below)]
             parts.append(folded("What the columns mean", _meanings(columns.items())))
     return joined(parts)
-
-
-def _alike(values: pd.Series) -> bool:
-    return bool(values.notna().all() and values.nunique() == 1)
 
 
 def _once(rows: pd.DataFrame, names: Sequence[str]) -> list[str]:
@@ -121,15 +117,12 @@ def _interval(study: Study, part: Part, columns: Iterable[str]) -> list[str]:
     for of in (name for name in columns if name in _INTERVALS):
         lines = intervals_said(rows, _INTERVALS[of])
         none = ["no interval: too few logs and objects; additional runs do not tell about other traffic"]
-        said += [_sentence(f"{without_unit(of)}: {_interval_words(line)}") for line in lines or none]
+        words = [line.replace("95 %: ", "95 % ").replace("no 95 % of", "no 95 % interval of") for line in lines or none]
+        said += [_sentence(f"{without_unit(of)}: {line}") for line in words]
     horizon = rows["ttd_rmst_horizon_s"].dropna() if "ttd_rmst_s" in columns else pd.Series(dtype=float)
     if len(horizon):
         said.append(f"In means an object that is never detected counts as {plain(float(horizon.iloc[0]))} s.")
     return said
-
-
-def _interval_words(line: str) -> str:
-    return line.replace("95 %: ", "95 % ").replace("no 95 % of", "no 95 % interval of")
 
 
 def _meanings(columns: Iterable[tuple[str, str]], names: Any = header) -> Html:
