@@ -240,8 +240,8 @@ def _as_file(schema: dict[str, Any]) -> None:
 class Experiment(Frozen):
     """An experiment file.
 
-    `logs`: paths, or mappings with what is otherwise for a log. `window_s`: what of each log is read, [from, to] in
-    seconds since the first message of its truth was logged.
+    `logs`: paths or URLs, or mappings with what is otherwise for a log. `window_s`: what of each log is read, [from,
+    to] in seconds since the first message of its truth was logged.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed

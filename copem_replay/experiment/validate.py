@@ -37,7 +37,7 @@ from copem_replay.io.open import name_of
 from copem_replay.io.recorded_output import recorded_output
 from copem_replay.io.recorded_units import recorded_unit
 from copem_replay.io.recording import Recording, moving_ids, read
-from copem_replay.io.together import File, Local, Place, at_hand, files_of, first_of
+from copem_replay.io.together import File, Local, Place, at_hand, first_of, paths_of
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def read_logs(
 
 def _gone(place: Place, key: Key | None) -> Refused | None:
     """A recording that is not there, or that cannot be asked for."""
-    for one in files_of(place):
+    for one in paths_of(place):
         try:
             if not is_there(one):
                 return Refused(one, "no such file", key)

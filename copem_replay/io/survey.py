@@ -12,10 +12,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Survey:
-    """`said`: as it was kept. `read`: the recording, as it was read then."""
+    """`said`: as it was kept. `read`: the recording, as it was read then. `about`: what it was found by."""
 
     said: Mapping[str, Any]
     read: Callable[[], Recording]
+    about: str = ""
 
 
 def whole(recording: Recording) -> Recording:

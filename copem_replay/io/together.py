@@ -41,7 +41,7 @@ Place: TypeAlias = Local | Remote
 """Where a log lies."""
 
 
-def files_of(place: Place) -> tuple[File, ...]:
+def paths_of(place: Place) -> tuple[File, ...]:
     """The recordings that a log is made of."""
     return place.paths if isinstance(place, Together) else (place,)
 

@@ -12,11 +12,11 @@ import inspect
 import json
 import platform
 import sys
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
@@ -26,6 +26,7 @@ from copem_replay.experiment.recorded_latency import RecordedLatency
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.onset import Requires
 
+T = TypeVar("T")
 NOT_OF_A_PIECE: Mapping[str, str] = {
     "logs": "which log, and how it is read, is in the recipe itself; other logs are not",
     "runs": "the range of runs is in the recipe itself",
@@ -53,6 +54,22 @@ def key_of(recipe: str) -> str:
     return hashlib.blake2b(recipe.encode(), digest_size=20).hexdigest()
 
 
+def for_all_logs(of: Callable[..., T]) -> Callable[..., T]:
+    """What is asked of one experiment, and of names in it, for each of its logs: worked out once."""
+    last: list[tuple[Experiment, dict[tuple[str, ...], T]]] = []
+
+    @wraps(of)
+    def once(experiment: Experiment, *names: str) -> T:
+        if not last or last[0][0] is not experiment:
+            last[:] = [(experiment, {})]
+        known = last[0][1]
+        if names not in known:
+            known[names] = of(experiment, *names)
+        return known[names]
+
+    return once
+
+
 @cache
 def fingerprint() -> dict[str, str]:
     """What makes the numbers beside the recipe: this package, the libraries, Python, the machine and its libc."""
@@ -75,6 +92,11 @@ def recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs: tupl
 
     `log`: the log's name and content, and how its parts go together. `runs`: None for what draws nothing.
     """
+    return canonical(_of_every_log(experiment, name) | {"log": dict(log), "runs": runs})
+
+
+@for_all_logs
+def _of_every_log(experiment: Experiment, name: str) -> dict[str, Any]:
     data = experiment.as_written()
     configuration = experiment.configurations[name]
     units, members = _closure(experiment, configuration), experiment.units_of(configuration)
@@ -83,8 +105,6 @@ def recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs: tupl
     mine = {
         "piece": 1,
         "fingerprint": fingerprint(),
-        "log": dict(log),
-        "runs": runs,
         "configuration": data["configurations"][name] | ({"units": members} if members else {}),
         "units": [(unit, data["units"][unit]) for unit in units],  # in the experiment's order, which decides ties
         "pems": {pem: data["pems"][pem] for pem in pems},
@@ -98,7 +118,7 @@ def recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs: tupl
     for key in NOT_OF_A_PIECE:
         within, _, last = key.rpartition(".")
         (data[within] if within else data).pop(last, None)
-    return canonical(data | mine)
+    return data | mine
 
 
 def _closure(experiment: Experiment, configuration: Configuration) -> list[str]:

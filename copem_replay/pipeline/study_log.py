@@ -25,7 +25,7 @@ from copem_replay.io.truth_digest import truth_digest
 from copem_replay.pipeline.facts import Facts, scene_as_json, scene_of
 from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.recipe import canonical, fingerprint, sources
+from copem_replay.pipeline.recipe import canonical, fingerprint, for_all_logs, key_of, sources
 
 _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
@@ -87,8 +87,8 @@ class StudyLog:
     def _found(self, alone: Experiment) -> Facts:
         if self.pieces is None:
             return Facts.of(self.whole(), self.replay(), alone)
-        about = survey_key(self.recording.place, alone)
-        said = self.pieces.known(about)
+        about, survey = survey_key(self.recording.place, alone), self.recording.survey
+        said = survey.said if survey is not None and survey.about == about else self.pieces.known(about)
         if said is not None and said["scene"]["log"] == self.name:
             return Facts.read(said["facts"])
         replay = self.replay()
@@ -116,17 +116,14 @@ def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
 
 def survey_key(place: Place, experiment: Experiment) -> str:
     """All that is known of a log depends on: its files as they are now, and the experiment, resolved for it."""
+    of_log = {"files": _stamps(place), "ahead_ns": place.ahead_ns if isinstance(place, Together) else ()}
+    return canonical(of_log | {"survey": 2, "of": _of_every_log(experiment)})
+
+
+@for_all_logs
+def _of_every_log(experiment: Experiment) -> str:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    return canonical(
-        {
-            "survey": 1,
-            "fingerprint": fingerprint(),
-            "own": sources(experiment),
-            "files": _stamps(place),
-            "ahead_ns": place.ahead_ns if isinstance(place, Together) else (),
-            "experiment": data,
-        }
-    )
+    return key_of(canonical({"fingerprint": fingerprint(), "own": sources(experiment), "experiment": data}))
 
 
 def _stamps(place: Place) -> list[tuple[object, ...]]:
@@ -141,14 +138,14 @@ def _stamps(place: Place) -> list[tuple[object, ...]]:
 
 def known_log(pieces: Pieces, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
     """A recording as it is known from before, in an experiment that is resolved for it; None: it has to be read."""
-    said = pieces.known(survey_key(place, experiment))
+    said = pieces.known(about := survey_key(place, experiment))
     if said is None:
         return None
     together, remote = place if isinstance(place, Together) else None, place if isinstance(place, Remote) else None
     first = first_of(place)
     return Recording(
         scene_of(said["scene"]), _nothing(), Path(first.name) if isinstance(first, Remote) else first, said["topic"],
-        tuple(said["notes"]), said["host"], together=together, remote=remote, survey=Survey(said, read),
+        tuple(said["notes"]), said["host"], together=together, remote=remote, survey=Survey(said, read, about),
     )  # fmt: skip
 
 

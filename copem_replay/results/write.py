@@ -21,7 +21,7 @@ from copem_replay.core.yaml import dump
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
-from copem_replay.io.together import File, files_of
+from copem_replay.io.together import File, paths_of
 from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
@@ -156,7 +156,7 @@ def _logs(folder: Path, result: Result, skipped: Sequence[tuple[File, str]]) -> 
     rows = [
         {
             "log": log.name,
-            "path": _utf8(" + ".join(written_name(one, folder) for one in files_of(log.recording.place))),
+            "path": _utf8(" + ".join(written_name(one, folder) for one in paths_of(log.recording.place))),
             "sha256": log.digests["sha256"],
             "episodes": facts.episodes,
             "rows": int(counts.get(log.name, 0)),
