@@ -12,7 +12,7 @@ import inspect
 import json
 import platform
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -60,9 +60,10 @@ def for_all_logs(of: Callable[..., T]) -> Callable[..., T]:
 
     @wraps(of)
     def once(experiment: Experiment, *names: str) -> T:
-        if not last or last[0][0] is not experiment:
-            last[:] = [(experiment, {})]
-        known = last[0][1]
+        about, known = last[0] if last else (None, {})
+        if about is not experiment:
+            known = {}
+            last[:] = [(experiment, known)]
         if names not in known:
             known[names] = of(experiment, *names)
         return known[names]
@@ -92,11 +93,12 @@ def recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs: tupl
 
     `log`: the log's name and content, and how its parts go together. `runs`: None for what draws nothing.
     """
-    return canonical(_of_every_log(experiment, name) | {"log": dict(log), "runs": runs})
+    data, own = _of_every_log(experiment, name)
+    return canonical(data | {"log": dict(log), "runs": runs, "own": digests(own)})
 
 
 @for_all_logs
-def _of_every_log(experiment: Experiment, name: str) -> dict[str, Any]:
+def _of_every_log(experiment: Experiment, name: str) -> tuple[dict[str, Any], list[Component]]:
     data = experiment.as_written()
     configuration = experiment.configurations[name]
     units, members = _closure(experiment, configuration), experiment.units_of(configuration)
@@ -109,16 +111,16 @@ def _of_every_log(experiment: Experiment, name: str) -> dict[str, Any]:
         "units": [(unit, data["units"][unit]) for unit in units],  # in the experiment's order, which decides ties
         "pems": {pem: data["pems"][pem] for pem in pems},
         "links": {link: data["links"][link] for link in links},
-        "own": sources(
-            configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
-            experiment.braking, *(experiment.pems[pem] for pem in pems),
-            *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
-        ),
-    }  # fmt: skip
+    }
+    own = own_components(
+        configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
+        experiment.braking, *(experiment.pems[pem] for pem in pems),
+        *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links),
+    )  # fmt: skip
     for key in NOT_OF_A_PIECE:
         within, _, last = key.rpartition(".")
         (data[within] if within else data).pop(last, None)
-    return data | mine
+    return data | mine, own
 
 
 def _closure(experiment: Experiment, configuration: Configuration) -> list[str]:
@@ -129,13 +131,17 @@ def _closure(experiment: Experiment, configuration: Configuration) -> list[str]:
     return [name for name in experiment.units if name in members or name == measure.distance_to]
 
 
-def sources(*models: BaseModel | None) -> dict[str, str]:
+def own_components(*models: BaseModel | None) -> list[Component]:
+    """Components that files decide: own ones, and recorded latencies."""
+    every = (one for model in models for one in _components(model))
+    return [one for one in every if is_own(type(one)) or isinstance(one, RecordedLatency)]
+
+
+def digests(own: Sequence[Component]) -> dict[str, str]:
     """SHA-256 of the files that own components are written in (not of what these import), and of recorded latencies."""
-    every = [one for model in models for one in _components(model)]
-    kinds = {type(one) for one in every if is_own(type(one))}
-    files = {kind: Path(inspect.getfile(kind)) for kind in kinds}
+    files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in own if is_own(type(one))}}
     found = {f"{k.__module__}:{k.__qualname__}": f.read_bytes() for k, f in files.items()}
-    found |= {one.file: repr(one.sorted_s).encode() for one in every if isinstance(one, RecordedLatency)}
+    found |= {one.file: repr(one.sorted_s).encode() for one in own if isinstance(one, RecordedLatency)}
     return {name: hashlib.sha256(content).hexdigest() for name, content in found.items()}
 
 

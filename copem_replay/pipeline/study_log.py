@@ -12,6 +12,7 @@ from uuid import uuid4
 
 import numpy as np
 
+from copem_replay.core.components import Component
 from copem_replay.core.remote import Remote
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.drive import of_log
@@ -25,7 +26,7 @@ from copem_replay.io.truth_digest import truth_digest
 from copem_replay.pipeline.facts import Facts, scene_as_json, scene_of
 from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.recipe import canonical, fingerprint, for_all_logs, key_of, sources
+from copem_replay.pipeline.recipe import canonical, digests, fingerprint, for_all_logs, key_of, own_components
 
 _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
@@ -116,14 +117,16 @@ def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
 
 def survey_key(place: Place, experiment: Experiment) -> str:
     """All that is known of a log depends on: its files as they are now, and the experiment, resolved for it."""
-    of_log = {"files": _stamps(place), "ahead_ns": place.ahead_ns if isinstance(place, Together) else ()}
-    return canonical(of_log | {"survey": 2, "of": _of_every_log(experiment)})
+    of_all, own = _of_every_log(experiment)
+    ahead_ns = place.ahead_ns if isinstance(place, Together) else ()
+    return canonical({"files": _stamps(place), "ahead_ns": ahead_ns, "of": of_all, "own": digests(own)})
 
 
 @for_all_logs
-def _of_every_log(experiment: Experiment) -> str:
+def _of_every_log(experiment: Experiment) -> tuple[str, list[Component]]:
     data = {key: value for key, value in experiment.as_written().items() if key not in _NOT_OF_A_SURVEY}
-    return key_of(canonical({"fingerprint": fingerprint(), "own": sources(experiment), "experiment": data}))
+    of_all = key_of(canonical({"survey": 2, "fingerprint": fingerprint(), "experiment": data}))
+    return of_all, own_components(experiment)
 
 
 def _stamps(place: Place) -> list[tuple[object, ...]]:
