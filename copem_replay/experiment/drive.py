@@ -5,8 +5,9 @@ What is replayed of a log takes the experiment from `of_log`; what all logs have
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from functools import wraps
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -15,6 +16,7 @@ from copem_replay.core.yaml import Key
 from copem_replay.experiment.schema import Configuration, Experiment, LogSettings, Unit
 from copem_replay.metrics.config import Measure, Objects
 
+T = TypeVar("T")
 _INSTEAD = {"on": "at", "at": "on", "pem": "recorded", "recorded": "pem", "classes": "ids", "ids": "classes"}
 """Of two keys that exclude each other, the one that is given takes the other's place."""
 
@@ -27,11 +29,32 @@ class SettingsError(ValueError):
         self.key, self.data, self.error = key, data, error
 
 
+def for_all_logs(of: Callable[..., T]) -> Callable[..., T]:
+    """What is asked of one experiment, and of names in it, for each of its logs: worked out once."""
+    last: list[tuple[Experiment, dict[tuple[str, ...], T]]] = []
+
+    @wraps(of)
+    def once(experiment: Experiment, *names: str) -> T:
+        about, known = last[0] if last else (None, {})
+        if about is not experiment:
+            known = {}
+            last[:] = [(experiment, known)]
+        if names not in known:
+            known[names] = of(experiment, *names)
+        return known[names]
+
+    return once
+
+
 def of_log(experiment: Experiment, log: str) -> Experiment:
     """The experiment of one log, by the log's name; the experiment itself where the log has no settings."""
-    mine = (entry for entry in experiment.logs if isinstance(entry, LogSettings) and entry.name == log)
-    settings = next(mine, None)
+    settings = _by_name(experiment).get(log)
     return experiment if settings is None else with_settings(experiment, settings)
+
+
+@for_all_logs
+def _by_name(experiment: Experiment) -> dict[str | None, LogSettings]:
+    return {entry.name: entry for entry in reversed(experiment.logs) if isinstance(entry, LogSettings)}
 
 
 def with_settings(experiment: Experiment, settings: LogSettings) -> Experiment:

@@ -287,16 +287,17 @@ def across_logs(experiment: Experiment, recordings: Sequence[Recording], source:
         return source.at(key, message) if source else message
 
     scenes = [recording.scene for recording in recordings]
+    at_place_of, names = {identity(r.place): r.scene for r in recordings}, [scene.log for scene in scenes]
+    count = Counter(names)
     for place, (entry, settings) in settings_by_place(experiment, source).items():
-        for scene in (r.scene for r in recordings if identity(r.place) == place):
-            if [one.log for one in scenes].count(scene.log) > 1:
-                yield at(
-                    ("logs", entry, "name"), f"expected a name of its own, found {scene.log!r} of another log, too"
-                )
-            for n, wanted in enumerate(with_settings(experiment, settings).measure.objects.ids or ()):
-                if "objects" in settings.measure and wanted not in scene.object_number:
-                    of_id: Key = ("logs", entry, "measure", "objects", "ids", n)
-                    yield at(of_id, f"no object {wanted!r} in the log; there are {moving_ids(scene)}")
+        if (scene := at_place_of.get(place)) is None:
+            continue
+        if count[scene.log] > 1:
+            yield at(("logs", entry, "name"), f"expected a name of its own, found {scene.log!r} of another log, too")
+        for n, wanted in enumerate(with_settings(experiment, settings).measure.objects.ids or ()):
+            if "objects" in settings.measure and wanted not in scene.object_number:
+                of_id: Key = ("logs", entry, "measure", "objects", "ids", n)
+                yield at(of_id, f"no object {wanted!r} in the log; there are {moving_ids(scene)}")
     everywhere = bound(experiment, recordings, source)
     kept = [of_log(everywhere, scene.log).configurations for scene in scenes]
     for name in experiment.configurations if scenes else ():
@@ -309,7 +310,6 @@ def across_logs(experiment: Experiment, recordings: Sequence[Recording], source:
             yield at(key, f"no object {wanted!r} in any log; the first has {moving_ids(scenes[0])}")
         elif all(scene.object_number[wanted] == scene.ego_ix for scene in there):
             yield at(key, f"{wanted!r} is the ego vehicle, which is not measured")
-    names = [scene.log for scene in scenes]
     for k, wanted in enumerate(experiment.show.logs if experiment.show else ()):
         if names and wanted not in ("first", "all", *names):
             yield at(("show", "logs", k), unknown("log", wanted, ["first", "all", *names]))

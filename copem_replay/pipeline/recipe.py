@@ -12,21 +12,21 @@ import inspect
 import json
 import platform
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache, wraps
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import BaseModel
 
 from copem_replay.core.components import Component
 from copem_replay.core.own_code import is_own
+from copem_replay.experiment.drive import for_all_logs
 from copem_replay.experiment.recorded_latency import RecordedLatency
 from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.onset import Requires
 
-T = TypeVar("T")
 NOT_OF_A_PIECE: Mapping[str, str] = {
     "logs": "which log, and how it is read, is in the recipe itself; other logs are not",
     "runs": "the range of runs is in the recipe itself",
@@ -52,23 +52,6 @@ def canonical(data: Any) -> str:
 def key_of(recipe: str) -> str:
     """The name of what is made by a recipe: BLAKE2b, 160 bits."""
     return hashlib.blake2b(recipe.encode(), digest_size=20).hexdigest()
-
-
-def for_all_logs(of: Callable[..., T]) -> Callable[..., T]:
-    """What is asked of one experiment, and of names in it, for each of its logs: worked out once."""
-    last: list[tuple[Experiment, dict[tuple[str, ...], T]]] = []
-
-    @wraps(of)
-    def once(experiment: Experiment, *names: str) -> T:
-        about, known = last[0] if last else (None, {})
-        if about is not experiment:
-            known = {}
-            last[:] = [(experiment, known)]
-        if names not in known:
-            known[names] = of(experiment, *names)
-        return known[names]
-
-    return once
 
 
 @cache

@@ -15,7 +15,7 @@ import numpy as np
 from copem_replay.core.components import Component
 from copem_replay.core.remote import Remote
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
-from copem_replay.experiment.drive import of_log
+from copem_replay.experiment.drive import for_all_logs, of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.checksum import sha256_of
 from copem_replay.io.containers.rosbag2_metadata import files_of
@@ -26,7 +26,7 @@ from copem_replay.io.truth_digest import truth_digest
 from copem_replay.pipeline.facts import Facts, scene_as_json, scene_of
 from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.prepare import Replay, prepare
-from copem_replay.pipeline.recipe import canonical, digests, fingerprint, for_all_logs, key_of, own_components
+from copem_replay.pipeline.recipe import canonical, digests, fingerprint, key_of, own_components
 
 _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
