@@ -14,9 +14,9 @@ if TYPE_CHECKING:  # what is wrong with an experiment is said before all that is
     from copem_replay.pipeline.memory import Size
     from copem_replay.pipeline.pieces import Pieces
 
-STATES_HELD = 1_000_000
-"""Object states of logs that stay in memory from the survey on (chosen: some 75 drives of 20 s); the first log does
-however long it is. All others are read again when it is their turn."""
+STATES_HELD = 250_000
+"""Object states of logs that stay in memory from the survey on (chosen: some 20 drives of 20 s, 200 MB); the first
+does however long it is. All others are read again when it is their turn."""
 
 
 class LogSurvey:
