@@ -136,8 +136,8 @@ def read_logs(
     names_of = _named(source) if source is not None and isinstance(paths, Mapping) else {}
     mine = settings_by_place(experiment, source)
     for path, key in keys.items():
-        if (gone := _gone(path, key)) is not None:
-            refused.append(gone)
+        if (missing := gone(path, key)) is not None:
+            refused.append(missing)
         elif (place := identity(path)) not in recordings:
             entry, settings = mine.get(place, (None, None))
             alone = experiment if settings is None else with_settings(experiment, settings)
@@ -157,7 +157,7 @@ def read_logs(
     return _with_names(recordings, given), refused
 
 
-def _gone(place: Place, key: Key | None) -> Refused | None:
+def gone(place: Place, key: Key | None) -> Refused | None:
     """A recording that is not there, or that cannot be asked for."""
     for one in paths_of(place):
         try:
