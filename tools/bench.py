@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 
 import bench_compare
+import bench_crew
 import bench_fit
 import bench_fusion
 import bench_links
@@ -355,6 +356,12 @@ def _spent(arguments: list[str]) -> Spent:
     return Spent(used.ru_utime + used.ru_stime, time.perf_counter() - began, used.ru_maxrss // 1024)
 
 
+def crew() -> Iterator[dict[str, object]]:
+    """Processes against threads, on recorded drives where they are; see bench_crew.py."""
+    with _scratch() as folder:
+        yield from bench_crew.crew(folder)
+
+
 def fit() -> Iterator[dict[str, object]]:
     """Fitting a perception error model to 10⁵ rows; see bench_fit.py."""
     yield from bench_fit.detection()
@@ -366,7 +373,8 @@ def compare() -> Iterator[dict[str, object]]:
 
 
 BENCHES = (
-    pieces, compare, visibility, memory, fit, paper, reading, writing, commands, reports, fusion, peers, links, crowd,
+    pieces, compare, crew, visibility, memory, fit, paper, reading, writing, commands, reports, fusion, peers, links,
+    crowd,
     long,
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Detection models that do something to their process where an object is 45 m away."""
+"""Detection models that do something to their process where an object is 45.5 m away."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 import copem_replay as cr
 
 
-class _At45(cr.DetectionModel):
+class _At45m5(cr.DetectionModel):
     spare: int = 0  # a process to which nothing is done
+    range_m: float = 45.5
 
     def probability(self, view):  # type: ignore[no-untyped-def]
-        if os.getpid() != self.spare and (np.abs(view.range_m - 45) < 1e-6).any():
+        if os.getpid() != self.spare and (np.abs(view.range_m - self.range_m) < 1e-6).any():
             self.happen()
         return 0.5 * np.ones(len(view.range_m))
 
@@ -22,21 +23,21 @@ class _At45(cr.DetectionModel):
         raise NotImplementedError
 
 
-class Deadly(_At45):
+class Deadly(_At45m5):
     """Kills its process."""
 
     def happen(self) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-class Failing(_At45):
+class Failing(_At45m5):
     """Raises, which is a defect of the model."""
 
     def happen(self) -> None:
         raise LookupError("this model fails")
 
 
-class Halting(_At45):
+class Halting(_At45m5):
     """Says so in a FIFO, and goes on when something is in another."""
 
     said: str

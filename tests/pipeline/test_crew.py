@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -10,11 +12,14 @@ from typing import Any
 
 import pytest
 
-from copem_replay.pipeline.crew import dask_workers
+from copem_replay.core.errors import CopemError, InputError
+from copem_replay.pipeline.crew import dask_workers, worker
+from copem_replay.pipeline.crew.crew import TaskFailedError
 from copem_replay.pipeline.crew.dask_workers import DaskWorkers
 from copem_replay.pipeline.pieces import Pieces
 from tests.cli.test_api import cr
-from tests.helpers.experiments import drive
+from tests.helpers.experiments import changed, drive
+from tests.helpers.recordings import Obj, write_recording
 from tests.pipeline.test_pieces import EXACT, FLEET, study
 
 OWN_SETTINGS = "logs: [a.mcap, {file: b.mcap, name: other, units: {mast: null}}]"
@@ -104,3 +109,144 @@ def test_the_same_bytes_by_a_pool_of_processes(here: Path) -> None:
     plain, computed, _ = replayed(study(), "plain", pieces="alone")
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert replayed(study(), "pool", pieces="kept", crew=pool) == (plain, computed, 0)
+
+
+def many(count: int) -> None:
+    """The recording `a` under so many more names."""
+    for k in range(count):
+        Path(f"name{k}.mcap").hardlink_to("a.mcap")
+
+
+def at_45_m_and_a_half(kind: str, **keys: Any) -> str:
+    """An experiment whose model does something in one log of many, but not to this process."""
+    thing = Obj(id=3, x=0.0, y=45.5, stationary=True)
+    frames = [(0.1 * k, [Obj(id=1, x=0.0), Obj(id=2, x=70.0 - k, vx=-10.0), thing]) for k in range(31)]
+    write_recording(Path("at45.mcap"), frames, host=1)
+    said = "".join(f", {name}: {value!r}" for name, value in keys.items())
+    model = f"{{kind: 'tests.helpers.bad_models:{kind}', spare: {os.getpid()}{said}}}"
+    return changed("logs: ['*.mcap']").replace("{kind: constant, probability: 0.5}", model)
+
+
+def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., DaskWorkers]) -> None:
+    many(10)
+    text = study("logs: ['*.mcap']")
+    plain, computed, _ = replayed(text, "plain", pieces="alone")
+    workers, killed = connected(), list[int]()
+
+    def kill(done: int, total: int) -> None:
+        """One while logs are surveyed, the others when some rows are there."""
+        pids = sorted(set(workers._client.run(os.getpid, on_error="ignore").values()) - {*killed})
+        if len(killed) < 3 and pids and (not killed or done > 0):
+            os.kill(pids[0], signal.SIGKILL)
+            killed.append(pids[0])
+
+    assert replayed(text, "dask", pieces="kept", crew=workers, progress=kill) == (plain, computed, 0)
+    assert len(killed) == 3
+    assert replayed(text, "again", pieces="kept") == (plain, 0, computed)
+
+
+def test_a_log_that_workers_die_of_is_named_and_the_others_are_done(connected: Callable[..., DaskWorkers]) -> None:
+    text, workers = at_45_m_and_a_half("Deadly"), connected()
+    where = r"died 3 times, last on 127.0.0.1:\d+ \(out of memory\?\); more memory per worker, or --skip-unreadable"
+    wanted = rf"^at45.mcap: the worker that replayed it {where}; what is done stays done in kept$"
+    with pytest.raises(InputError, match=wanted):
+        replayed(text, "out", pieces="kept", crew=workers)
+    assert workers.lost >= 3
+    others = text.replace("'*.mcap'", "a.mcap, b.mcap")
+    plain, _, _ = replayed(others, "plain")
+    surveyed = len(list(Path("kept/logs").iterdir()))
+    assert surveyed == 2
+    assert replayed(others, "out", pieces="kept", crew=workers)[0] == plain
+    assert len(list(Path("kept/logs").iterdir())) == surveyed
+
+
+def test_a_dead_pool_is_said_and_what_is_done_stays(here: Path) -> None:
+    """A pool of processes breaks with its first dead one: no telling of what."""
+    text = at_45_m_and_a_half("Deadly")
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        words = r"^crew: a worker died, and its executor with it \(BrokenProcessPool\); 0 of 3 logs are in kept; the"
+        with pytest.raises(CopemError, match=words):
+            replayed(text, "out", pieces="kept", crew=pool)
+
+
+def test_a_defect_is_told_once_with_its_log_and_pieces(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+
+    def fail(*given: Any) -> None:
+        begun.append(given)
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(worker, "outcomes", fail)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(TaskFailedError) as caught:
+        replayed(study(), "out", pieces="kept", crew=pool)
+    said = str(caught.value)
+    assert said.startswith("a.mcap, runs (0, 64): GT, PEM, coPEM, runs (64, 128)")
+    assert said.count("Traceback") == said.count("ZeroDivisionError: a defect") == 1
+    assert len(begun) == 1  # and not tried again
+
+
+def test_workers_that_differ_are_refused(
+    connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch, here: Path
+) -> None:
+    expected = dask_workers.fingerprint() | {"numba": "0.1.2"}
+    monkeypatch.setattr(dask_workers, "fingerprint", lambda: expected)
+    words = (
+        r"^tcp://127.0.0.1:\d+: worker \S+ has numba \d[\d.]+, expected 0.1.2 \(\d of \d workers differ\): results wou"
+    )
+    with pytest.raises(CopemError, match=words):
+        connected()
+    with ThreadPoolExecutor(1) as pool:  # which is asked with its first task
+        monkeypatch.setattr(worker, "fingerprint", lambda: expected)
+        with pytest.raises(
+            CopemError, match=r"^worker \S+ has numba 0.1.2, expected \d\S+: results would not be the same"
+        ):
+            replayed(study(), "out", pieces="kept", crew=pool)
+
+
+def test_pieces_that_a_worker_does_not_see(
+    connected: Callable[..., DaskWorkers], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the folder were on this machine alone: what is written is not where workers look."""
+    monkeypatch.setattr(dask_workers, "greeting", _blind)
+    words = r"^kept: not visible from worker \S+; --pieces with a shared folder or s3://…$"
+    with pytest.raises(CopemError, match=words):
+        connected()
+
+
+def _blind(expected: dict[str, str], pieces: str, folder: str, token: str) -> tuple[str, str | None, bool]:
+    return dask_workers.greeting(expected, f"{pieces} of another machine", folder, token)
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        (
+            "here",
+            r"^--cluster: expected local, local:N, tcp://HOST:PORT, tls://HOST:PORT or .*\(.json\), found 'here'$",
+        ),
+        ("local:0", r"^--cluster: expected local"),
+    ],
+)
+def test_addresses(address: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        dask_workers.check_address(address)
+
+
+def test_a_scheduler_that_is_not_there(here: Path) -> None:
+    with pytest.raises(CopemError, match=r"^--cluster: tcp://127.0.0.1:1: no scheduler answers there \("):
+        DaskWorkers("tcp://127.0.0.1:1", Pieces("kept"), 0, wait_s=0.1)
+
+
+def test_what_a_crew_needs(here: Path) -> None:
+    Path("e.yaml").write_text(study())
+    with ThreadPoolExecutor(1) as pool:
+        with pytest.raises(InputError, match=r"^crew: expected `pieces`, too: a folder or a URL that all its workers"):
+            cr.run("e.yaml", crew=pool)
+        with pytest.raises(InputError, match=r"^crew: expected paths of recordings"):
+            cr.run("e.yaml", cr.read_recordings("e.yaml"), pieces="kept", crew=pool)
+        Path("b.mcap").write_bytes(b"nothing")
+        with pytest.raises(InputError, match=r"^b.mcap: expected an MCAP file") as caught:
+            cr.run("e.yaml", pieces="kept", crew=pool)
+        with pytest.raises(InputError) as alone:
+            cr.run("e.yaml", pieces="other")
+    assert caught.value.problems == alone.value.problems

@@ -52,8 +52,8 @@ class Workers(Executor):
         """How many tasks it does at once."""
         raise NotImplementedError
 
-    def give(self, task: Task, *, alone: bool) -> Future[Receipt]:
-        """Submit a task. `alone`: nothing else is, so that the first death is its own doing."""
+    def give(self, task: Task) -> Future[Receipt]:
+        """Submit a task."""
         raise NotImplementedError
 
     def come_back(self) -> None:
@@ -73,7 +73,7 @@ class _Plain(Workers):
             return max(sum(map(int, client.nthreads().values())), 1)
         return int(getattr(self._executor, "_max_workers", None) or os.cpu_count() or 1)
 
-    def give(self, task: Task, *, alone: bool) -> Future[Receipt]:
+    def give(self, task: Task) -> Future[Receipt]:
         return self._executor.submit(done, task)
 
     def come_back(self) -> None:
@@ -110,7 +110,7 @@ class Crew:
         self._pieces, self._tell = pieces, tell
         self._progress = CrewProgress("", 0, 0)
         self._lost: dict[str, WorkerDiedError] = {}  # logs at which workers died, by their identities
-        self.peak_bytes: dict[str, int] = {}
+        self.peak_bytes = 0  # the most memory a worker has had
 
     def survey(
         self, experiment: Experiment, places: Mapping[Place, Key | None], source: Source, *, skip_unreadable: bool
@@ -203,12 +203,11 @@ class Crew:
         self._said()
         try:
             while waiting or suspects or flying:
-                alone = not waiting and not flying
-                source, at_once = (suspects, 1) if alone else (waiting, self._workers.threads())
+                source, at_once = (waiting, self._workers.threads()) if waiting or flying else (suspects, 1)
                 while source and len(flying) < at_once:
                     task = source.popleft()
                     if identity(task.log.place) not in self._lost:
-                        flying[self._workers.give(task, alone=alone)] = task
+                        flying[self._workers.give(task)] = task
                 finished, _ = wait(flying, TICK_S, FIRST_COMPLETED)
                 self._said()
                 if any(future.cancelled() for future in finished):  # who had them all is gone
@@ -244,7 +243,7 @@ class Crew:
                 raise
             deaths, last = error.allowed_failures + 1, error.last_worker.address  # type: ignore[attr-defined]
             raise WorkerDiedError(deaths, last, alone=True) from None
-        self.peak_bytes[receipt.host] = max(receipt.peak_bytes, self.peak_bytes.get(receipt.host, 0))
+        self.peak_bytes = max(receipt.peak_bytes, self.peak_bytes)
         if receipt.failure is not None:
             pieces = "".join(f", runs {work.runs}: {', '.join(work.keys)}" for work in task.work)
             raise TaskFailedError(f"{task.log.place}{pieces}: on worker {receipt.host}:\n{receipt.failure}")

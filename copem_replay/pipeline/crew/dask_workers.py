@@ -62,7 +62,7 @@ class DaskWorkers(Workers):
         self._given: dict[str, tuple[Future[Receipt], int]] = {}  # and how many pieces, by the keys of Dask
         self._unwanted: list[Any] = []
         self._deaths, self._beside = Counter[str](), set[str]()  # … while others of ours were there
-        self._patience, self._threads, self._changed = MOST_DEATHS, 1, True
+        self._threads, self._changed = 1, True
         logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # what matters is said in our own words
         self._cluster = _local(int(address.partition(":")[2] or cores)) if _LOCAL.fullmatch(address) else None
         try:
@@ -73,24 +73,22 @@ class DaskWorkers(Workers):
             self._begin(time.monotonic() + self._wait_s)
         except TimeoutError:
             self.close()
-            raise CopemError(f"--cluster: {address}: there is no worker, after {self._wait_s:.0f} s") from None
+            raise CopemError(f"--cluster: {address}: there is no worker, after {self._wait_s:g} s") from None
         except BaseException:
             self.close()
             raise
 
     def threads(self) -> int:
         """How many tasks it does at once."""
-        while self._unwanted:
-            self._unwanted.pop().cancel()
         if self._changed:
             self._changed = False
             with suppress(OSError):  # gone: futures say so
                 self._threads = max(sum(self._client.nthreads().values()), 1)
         return self._threads
 
-    def give(self, task: Task, *, alone: bool) -> Future[Receipt]:
-        """Submit a task. `alone`: nothing else is, so that the first death is its own doing."""
-        self._patience = 1 if alone else MOST_DEATHS
+    def give(self, task: Task) -> Future[Receipt]:
+        """Submit a task."""
+        self._forget()
         mine: Future[Receipt] = Future()
         key = f"copem-{secrets.token_hex(8)}"
         self._given[key] = mine, len(task.keys)
@@ -108,15 +106,21 @@ class DaskWorkers(Workers):
                 self._client = self._connected(until_s - time.monotonic())
                 self._begin(until_s)
                 return
-        raise TimeoutError(f"{self.address}: the scheduler has not answered for {self._wait_s:.0f} s")
+        raise TimeoutError(f"{self.address}: the scheduler has not answered for {self._wait_s:g} s")
 
     def close(self) -> None:
         """Cancel what has not begun, and end what was begun here."""
-        with suppress(OSError):
-            self.threads()
+        with suppress(OSError):  # which a TimeoutError is
+            self._forget()
             self._client.close(timeout=1)
         if self._cluster is not None:
-            self._cluster.close(timeout=10)
+            with suppress(OSError):
+                self._cluster.close(timeout=10)
+
+    def _forget(self) -> None:
+        """Tell Dask of the tasks that nobody waits for any more."""
+        while self._unwanted:
+            self._unwanted.pop().cancel()
 
     def _connected(self, timeout_s: float) -> Any:
         """Raises OSError: nobody answers."""
@@ -161,7 +165,7 @@ class DaskWorkers(Workers):
             self.again += pieces
             self._deaths[key] += 1
             self._beside |= {key} if len(keys) > 1 else set()
-            if self._deaths[key] >= self._patience:
+            if self._deaths[key] >= MOST_DEATHS:
                 host, alone = said["worker"].partition("://")[2], key not in self._beside
                 with suppress(InvalidStateError):
                     mine.set_exception(WorkerDiedError(self._deaths[key], host, alone=alone))
@@ -178,8 +182,8 @@ def _landed(given: Any, mine: Future[Receipt]) -> None:
         try:
             mine.set_result(given.result())
         except (CancelledError, OSError):  # the scheduler is gone
-            mine.cancel()
-            mine.set_running_or_notify_cancel()
+            if mine.cancel():
+                mine.set_running_or_notify_cancel()
         except Exception as error:
             mine.set_exception(error)
 
@@ -204,8 +208,11 @@ def _unlike(worker: str, said: tuple[str, str | None, bool] | Exception) -> str:
 
 def _local(count: int) -> Any:
     """Workers on this machine, a process each, that nobody else is told of."""
+    import dask
     import distributed
 
+    # A worker that dies again while it starts is started again, however long that takes.
+    dask.config.set({"distributed.deploy.lost-worker-timeout": "365 days"})
     return distributed.LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
         memory_limit=None, silence_logs=logging.CRITICAL + 1, scheduler_kwargs={"allowed_failures": 1000},

@@ -1,0 +1,179 @@
+"""Schedulers and workers as users start them, on 127.0.0.1: what docs/guide/scale.md says to type."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from copem_replay.core.errors import CopemError
+from copem_replay.pipeline.crew.dask_workers import DaskWorkers
+from copem_replay.pipeline.pieces import Pieces
+from tests.cli.test_api import cr
+from tests.helpers.experiments import changed, drive
+
+ROOT = Path(__file__).parents[2]
+BIN = Path(sys.executable).parent
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    drive(tmp_path / "a.mcap")
+    for name in "bcdef":
+        (tmp_path / f"{name}.mcap").hardlink_to("a.mcap")
+    (tmp_path / "e.yaml").write_text(changed("logs: ['*.mcap']"))
+    return tmp_path
+
+
+@pytest.fixture
+def start(here: Path) -> Iterator[Start]:
+    """Starts a command, in a group of its own, that is ended with the test."""
+    begun: list[subprocess.Popen[str]] = []
+
+    def started(command: str) -> subprocess.Popen[str]:
+        program, *words = command.split()
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        begun.append(
+            subprocess.Popen(
+                [str(BIN / program), *words], cwd=here, env=environment, text=True, start_new_session=True,
+                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            )
+        )  # fmt: skip
+        return begun[-1]
+
+    yield started
+    for process in begun:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def scheduler(start: Start, port: int = 0) -> tuple[subprocess.Popen[str], str]:
+    """A scheduler that has written `scheduler.json`, and its address."""
+    command = f"dask scheduler --host 127.0.0.1 --port {port} --no-dashboard --scheduler-file scheduler.json"
+    process = start(command)
+    assert process.stderr is not None
+    found = (re.search(r"Scheduler at: +(tcp://[0-9.:]+)", line) for line in process.stderr)
+    return process, next(one[1] for one in found if one is not None)
+
+
+def files(out: str) -> dict[str, bytes]:
+    return {str(path.relative_to(out)): path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
+
+
+@pytest.mark.long
+def test_commands_of_the_guide(here: Path, start: Start) -> None:
+    cr.run("e.yaml").save("plain")
+    scheduler(start)
+    assert json.loads(Path("scheduler.json").read_text())["address"].startswith("tcp://127.0.0.1:")
+    start("dask worker --scheduler-file scheduler.json --nworkers 2 --nthreads 1 --host 127.0.0.1 --no-dashboard")
+    command = [BIN / "copem-replay", "run", "e.yaml", "--cluster", "scheduler.json", "--out", "study"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == "pieces: 18 computed, 0 found in study.pieces\n"
+    assert files("study") == files("plain")
+
+
+@pytest.mark.long
+def test_a_scheduler_that_is_killed_and_comes_back(here: Path, start: Start) -> None:
+    cr.run("e.yaml").save("plain")
+    first, address = scheduler(start)
+    worker = f"dask worker {address} --nworkers 1 --nthreads 1 --host 127.0.0.1 --no-dashboard"
+    before = start(worker)
+    workers = DaskWorkers(address, Pieces("kept"), 0)
+    killed: list[int] = []
+
+    def kill(done: int, total: int) -> None:
+        if done and not killed:
+            killed.append(done)
+            for process in (first, before):
+                os.killpg(process.pid, signal.SIGKILL)
+            scheduler(start, int(address.rpartition(":")[2]))
+            start(worker)
+
+    result = cr.run("e.yaml", pieces="kept", crew=workers, progress=kill)
+    workers.close()
+    result.save("out")
+    assert killed
+    assert files("out") == files("plain")
+
+
+def test_a_scheduler_that_does_not_come_back(here: Path, start: Start) -> None:
+    first, address = scheduler(start)
+    start(f"dask worker {address} --nworkers 1 --nthreads 1 --host 127.0.0.1 --no-dashboard")
+    workers = DaskWorkers(address, Pieces("kept"), 0)
+    workers._wait_s = 0.5
+
+    def kill(done: int, total: int) -> None:
+        if done and first.poll() is None:
+            os.killpg(first.pid, signal.SIGKILL)
+            first.wait()
+
+    words = (
+        rf"^{address}: the scheduler has not answered for 0 s; [1-5] of 6 logs are in kept; the same command goes on$"
+    )
+    with pytest.raises(CopemError, match=words):
+        cr.run("e.yaml", pieces="kept", crew=workers, progress=kill)
+    workers.close()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_ends_all_and_says_what_is_done(number: int, code: int, here: Path, start: Start) -> None:
+    """A signal to the group, as a terminal sends it, while a worker is busy."""
+    for name in ("said", "go_on"):
+        os.mkfifo(name)
+    model = "{kind: 'tests.helpers.bad_models:Halting', said: said, go_on: go_on, range_m: 60}"
+    text = Path("e.yaml").read_text().replace("{kind: constant, probability: 0.5}", model)
+    Path("e.yaml").write_text(text)
+    command = start("copem-replay run e.yaml --cluster local:1")
+    with open("said", "rb") as file:
+        assert file.read(1) == b"."
+    os.killpg(command.pid, number)
+    _, said = command.communicate(timeout=60)  # until the last of its processes has closed the pipe
+    assert command.returncode == code
+    assert said == "interrupted; 0 of 6 logs are in out/e.pieces\n"
+
+
+@pytest.mark.long
+def test_local_workers_are_told_of_on_this_machine_only(here: Path, start: Start) -> None:
+    """Every port that the command and its worker listen at, by the kernel's own table."""
+    os.mkfifo("said")
+    os.mkfifo("go_on")
+    model = "{kind: 'tests.helpers.bad_models:Halting', said: said, go_on: go_on, range_m: 60}"
+    text = Path("e.yaml").read_text().replace("{kind: constant, probability: 0.5}", model)
+    Path("e.yaml").write_text(text)
+    command = start("copem-replay run e.yaml --cluster local:1")
+    with open("said", "rb") as file:
+        file.read(1)
+    mine = {*inodes(command.pid)}
+    assert all(local == "0100007F" for local, inode in listening() if inode in mine)
+    assert sum(inode in mine for _, inode in listening()) >= 2
+
+
+def inodes(leader: int) -> Iterator[str]:
+    """Of the sockets of all processes of a session."""
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if os.getsid(int(process.name)) == leader:
+                for fd in (process / "fd").iterdir():
+                    yield from re.findall(r"^socket:\[(\d+)\]$", os.readlink(fd))
+        except OSError:  # it has ended
+            continue
+
+
+def listening() -> list[tuple[str, str]]:
+    """Address, in hexadecimal digits, and inode of each socket that listens."""
+    found = []
+    for table in ("tcp", "tcp6"):
+        rows = [line.split() for line in Path("/proc/net", table).read_text().splitlines()[1:]]
+        found += [(row[1].partition(":")[0], row[9]) for row in rows if row[3] == "0A"]
+    return found

@@ -1,0 +1,83 @@
+"""What processes give: `--cluster local:2` against one thread and two, on recorded drives, and memory of a worker."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+DATA = Path(__file__).parents[2] / "shared/data"
+DRIVES = ("av2_3b3570b4", "nuscenes_scene0061", "nuscenes_scene0916")
+NAMES, RUNS = 11, 1000
+EXPERIMENT = f"""\
+version: 1
+logs: ["*.mcap"]
+runs: {RUNS}
+show: null
+max_gap_s: 0.6
+pems: {{cam: [{{when: {{range_m: [0, 80]}}, detection: {{kind: visible_share}}}}]}}
+units: {{ego: {{on: ego, height_m: 1.8, pem: cam}}}}
+configurations: {{alone: {{units: [ego]}}, late: {{units: [ego], latency_s: 0.3}}}}
+measure: {{accuracy: false}}
+"""
+
+
+def crew(folder: Path) -> Iterator[dict[str, object]]:
+    """Eleven names of three recorded drives; seconds from reading to the tables, Dask's start-up apart."""
+    data = Path(os.environ.get("COPEM_REPLAY_DATA", DATA))
+    if any(not (data / f"{name}.mcap").exists() for name in DRIVES):
+        yield {"crew": f"skipped: no recorded drives ({', '.join(DRIVES)}) in {data}"}
+        return
+    for k in range(NAMES):
+        shutil.copy(data / f"{DRIVES[k % len(DRIVES)]}.mcap", folder / f"drive{k:02d}.mcap")
+    (folder / "e.yaml").write_text(EXPERIMENT)
+    ways = ("one_thread", "two_threads", "local:2")
+    found = {way: [] for way in ways}
+    for _ in range(2):
+        for way in ways:
+            shutil.rmtree(folder / "kept", ignore_errors=True)
+            ended = subprocess.run(
+                [sys.executable, __file__, way, str(folder)], check=True, capture_output=True, text=True
+            )
+            found[way].append([float(value) for value in ended.stdout.split()])
+    one, two, local = (min(found[way]) for way in ways)
+    yield {
+        "crew_speed_up": round(one[0] / local[0], 2), "threads_speed_up": round(one[0] / two[0], 2),
+        "seconds": round(local[0], 1), "start_s": round(local[1], 1), "one_thread_s": round(one[0], 1),
+        "worker_peak_mb": round(local[2]), "rows": int(one[3]),
+    }  # fmt: skip
+
+
+def _one(way: str, folder: Path) -> None:
+    """Seconds of one way, of its start, megabytes of a worker at most, rows."""
+    import copem_replay as cr
+    from copem_replay.cli.api.run import replayed, with_crew
+    from copem_replay.cli.api.study import prepared, study_of
+    from copem_replay.pipeline.crew.crew import Crew
+    from copem_replay.pipeline.crew.dask_workers import DaskWorkers
+    from copem_replay.pipeline.pieces import Pieces
+
+    os.chdir(folder)
+    cr.run("e.yaml", "drive00.mcap", jobs=1)  # compiled, and warm
+    if way != "local:2":
+        began_s = time.perf_counter()
+        result = cr.run("e.yaml", jobs=1 if way == "one_thread" else 2)
+        print(time.perf_counter() - began_s, 0, 0, len(result.detections))
+        return
+    pieces, began_s = Pieces("kept"), time.perf_counter()
+    workers = DaskWorkers(way, pieces, 2)
+    start_s, began_s = time.perf_counter() - began_s, time.perf_counter()
+    hands = Crew(workers, pieces)
+    study = with_crew(lambda: study_of("e.yaml", None, pieces, hands), hands)
+    result = replayed(study, prepared(study)[0], 1, None, pieces)
+    took_s = time.perf_counter() - began_s
+    workers.close()
+    print(took_s, start_s, hands.peak_bytes / 1e6, len(result.detections))
+
+
+if __name__ == "__main__":
+    _one(sys.argv[1], Path(sys.argv[2]))
