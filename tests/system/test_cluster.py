@@ -119,7 +119,7 @@ def test_a_scheduler_that_does_not_come_back(here: Path, start: Start) -> None:
             first.wait()
 
     words = (
-        rf"^{address}: the scheduler has not answered for 0 s; [1-5] of 6 logs are in kept; the same command goes on$"
+        rf"^{address}: the scheduler has not answered for 0.5 s; [1-5] of 6 logs are in kept; the same command goes on$"
     )
     with pytest.raises(CopemError, match=words):
         cr.run("e.yaml", pieces="kept", crew=workers, progress=kill)
@@ -137,26 +137,14 @@ def test_an_interrupt_ends_all_and_says_what_is_done(number: int, code: int, her
     command = start("copem-replay run e.yaml --cluster local:1")
     with open("said", "rb") as file:
         assert file.read(1) == b"."
+    mine = {*inodes(command.pid)}
+    addresses = [address for address, inode in listening() if inode in mine]
+    assert len(addresses) >= 2  # of the scheduler and of a worker
+    assert {*addresses} == {"0100007F"}  # 127.0.0.1
     os.killpg(command.pid, number)
     _, said = command.communicate(timeout=60)  # until the last of its processes has closed the pipe
     assert command.returncode == code
     assert said == "interrupted; 0 of 6 logs are in out/e.pieces\n"
-
-
-@pytest.mark.long
-def test_local_workers_are_told_of_on_this_machine_only(here: Path, start: Start) -> None:
-    """Every port that the command and its worker listen at, by the kernel's own table."""
-    os.mkfifo("said")
-    os.mkfifo("go_on")
-    model = "{kind: 'tests.helpers.bad_models:Halting', said: said, go_on: go_on, range_m: 60}"
-    text = Path("e.yaml").read_text().replace("{kind: constant, probability: 0.5}", model)
-    Path("e.yaml").write_text(text)
-    command = start("copem-replay run e.yaml --cluster local:1")
-    with open("said", "rb") as file:
-        file.read(1)
-    mine = {*inodes(command.pid)}
-    assert all(local == "0100007F" for local, inode in listening() if inode in mine)
-    assert sum(inode in mine for _, inode in listening()) >= 2
 
 
 def inodes(leader: int) -> Iterator[str]:
