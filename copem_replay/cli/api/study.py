@@ -17,7 +17,7 @@ from copem_replay.experiment.file import Source, address, entries_of, identity, 
 from copem_replay.experiment.schema import Experiment, output_unit
 from copem_replay.experiment.validate import Refused, across_logs, bound, log_names, problems, read_logs
 from copem_replay.io.recording import Recording
-from copem_replay.io.together import File, files_of, first_of
+from copem_replay.io.together import File, first_of, paths_of
 
 if TYPE_CHECKING:  # it imports what a look at an experiment does not need
     from copem_replay.pipeline.crew.crew import Crew
@@ -132,7 +132,7 @@ def read_study(
     here = {place: key for place, key in places.items() if identity(place) not in away}
     recordings, refused = read_logs(experiment, here, source, survey)
     if away:  # in the order of the experiment
-        at = {path: k for k, place in enumerate(places) for path in files_of(place)}
+        at = {path: k for k, place in enumerate(places) for path in paths_of(place)}
         refused = sorted([*refused, *(log for logs in away.values() for log in logs)], key=lambda log: at[log.path])
     if not recordings and not refused and not found:
         found.append(source.at(("logs",), "expected at least one recording, found none"))

@@ -213,9 +213,11 @@ def _local(count: int) -> Any:
 
     # A worker that dies again while it starts is started again, however long that takes.
     dask.config.set({"distributed.deploy.lost-worker-timeout": "365 days"})
+    # Without a dashboard the scheduler still listens for requests about its health; at any port, for 8787 may be taken.
     return distributed.LocalCluster(
-        n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
-        memory_limit=None, silence_logs=logging.CRITICAL + 1, scheduler_kwargs={"allowed_failures": 1000},
+        n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+        memory_limit=None, silence_logs=logging.CRITICAL + 1,
+        scheduler_kwargs={"allowed_failures": 1000, "dashboard": False},
     )  # fmt: skip
 
 
