@@ -118,8 +118,9 @@ def read_study(
     survey: LogSurvey | None = None,
     crew: Crew | None = None,
 ) -> Study:
-    """Read the recordings of an experiment, but those that are known to the survey, and those that a crew can read.
-    The survey says what stays in memory.
+    """Read the recordings of an experiment, but those that are known to the survey, which says what stays in memory.
+
+    A crew reads those that are not known before.
 
     Raises InputError with every problem of it and of them.
     """

@@ -160,6 +160,7 @@ class Crew:
             left[task.log.name] -= 1
             computed += len(task.keys)
             self._said(int(left[task.log.name] == 0), task.rows)
+        self._pieces.store.refresh()  # for what workers have written
         self._pieces.computed += computed
         self._pieces.found -= computed  # which gathering is going to find
         return len(self._lost) > lost

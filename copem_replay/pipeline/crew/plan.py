@@ -13,9 +13,9 @@ from pathlib import Path
 
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.drive import of_log, with_settings
-from copem_replay.experiment.file import Source, at_place, identity, is_there
+from copem_replay.experiment.file import Source, at_place, identity
 from copem_replay.experiment.schema import Experiment, LogSettings
-from copem_replay.experiment.validate import log_names, settings_by_place
+from copem_replay.experiment.validate import gone, log_names, settings_by_place
 from copem_replay.io.together import Place, first_of
 from copem_replay.pipeline.crew.task import LogTask, Task, Work
 from copem_replay.pipeline.pieces import Pieces, ranges
@@ -35,7 +35,7 @@ def unsurveyed(
     experiment: Experiment, places: Mapping[Place, Key | None], source: Source, pieces: Pieces
 ) -> dict[str, Task]:
     """Surveys of the logs of which something is not known, by their identities."""
-    there = {identity(place): place for place in places if is_there(place)}
+    there = {identity(place): place for place in places if gone(place, None) is None}
     mine = settings_by_place(experiment, source)
     named = {whose: settings.name for whose, (_, settings) in mine.items() if settings.name is not None}
     unnamed = [whose for whose in there if whose not in named]
