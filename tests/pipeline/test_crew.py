@@ -19,6 +19,7 @@ from copem_replay.pipeline.crew.dask_workers import DaskWorkers
 from copem_replay.pipeline.pieces import Pieces
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
+from tests.helpers.object_storage import Bucket
 from tests.helpers.recordings import Obj, write_recording
 from tests.pipeline.test_pieces import EXACT, FLEET, study
 
@@ -111,6 +112,17 @@ def test_the_same_bytes_by_a_pool_of_processes(here: Path) -> None:
         assert replayed(study(), "pool", pieces="kept", crew=pool) == (plain, computed, 0)
 
 
+def test_recordings_and_pieces_under_urls_by_a_pool_of_processes(here: Path, bucket: Bucket) -> None:
+    bucket.put(Path("a.mcap"), "drives/a.mcap")
+    bucket.put(Path("b.mcap"), "drives/b.mcap")
+    text = study(f"logs: ['{bucket.url}/drives/*.mcap']", runs=70)
+    plain, _, _ = replayed(text, "plain")
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        kept = f"{bucket.url}/kept"
+        assert replayed(text, "pool", pieces=kept, crew=pool) == (plain, 2 * 3 * 2, 0)
+        assert replayed(text, "again", pieces=kept, crew=pool) == (plain, 0, 2 * 3 * 2)
+
+
 def many(count: int) -> None:
     """The recording `a` under so many more names."""
     for k in range(count):
@@ -167,6 +179,17 @@ def test_a_dead_pool_is_said_and_what_is_done_stays(here: Path) -> None:
         words = r"^crew: a worker died, and its executor with it \(BrokenProcessPool\); 0 of 3 logs are in kept; the"
         with pytest.raises(CopemError, match=words):
             replayed(text, "out", pieces="kept", crew=pool)
+
+
+def test_pieces_that_are_kept_elsewhere_are_missed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "_pieces_at", lambda address, folder: Pieces("elsewhere"))
+    Path("e.yaml").write_text(study())
+    cr.run("e.yaml", pieces="kept", recordings=["a.mcap"])  # so that this log is known
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(CopemError, match=r"^kept: what workers keep there is not seen fr"),
+    ):
+        replayed(study("seed: 2"), "out", pieces="kept", crew=pool)
 
 
 def test_a_defect_is_told_once_with_its_log_and_pieces(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -153,16 +153,19 @@ class Crew:
         self._progress = CrewProgress(
             "replaying", len(logs) - len(left), len(logs), rows=sum(task.rows for task in tasks)
         )
-        lost, computed = len(self._lost), 0
+        lost, computed = len(self._lost), list[str]()
         for task, receipt in self._done(tasks):
             if receipt.problems or receipt.refused:
                 raise CopemError([*receipt.problems, *(log.said(None) for log in receipt.refused)])
             left[task.log.name] -= 1
-            computed += len(task.keys)
+            computed += task.keys
             self._said(int(left[task.log.name] == 0), task.rows)
-        self._pieces.store.refresh()  # for what workers have written
-        self._pieces.computed += computed
-        self._pieces.found -= computed  # which gathering is going to find
+        there = self._pieces.keys()
+        if not all(map(there, computed)):
+            where = self._pieces.store.where
+            raise CopemError(f"{where}: what workers keep there is not seen from here; a shared folder or s3://…")
+        self._pieces.computed += len(computed)
+        self._pieces.found -= len(computed)  # which gathering is going to find
         return len(self._lost) > lost
 
     @property
