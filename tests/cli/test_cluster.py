@@ -1,0 +1,53 @@
+"""What `--cluster` says of its progress, and the hint that there is such a thing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from copem_replay.cli.cluster import hint
+from copem_replay.cli.progress import CrewLines
+from copem_replay.pipeline.crew.crew import CrewProgress
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_line_a_minute_with_logs_rows_time_left_and_lost_workers(capsys: pytest.CaptureFixture[str]) -> None:
+    now_s = [0.0]
+    lines = CrewLines(lambda: now_s[0])
+    surveyed = CrewProgress("surveying", 100, 5000)
+    lines(surveyed)
+    now_s[0] = 61.0
+    lines(surveyed)
+    now_s[0] = 100.0
+    lines(CrewProgress("replaying", 0, 5000, 0, 1000_000_000))
+    now_s[0] = 149.3  # 83 M rows in 49.3 s: 917 M more take 545 s
+    lines(CrewProgress("replaying", 412, 5000, 83_000_000, 1000_000_000, lost=1))
+    now_s[0] = 150.0
+    lines(CrewProgress("replaying", 413, 5000, 83_000_000, 1000_000_000, lost=1))
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "surveying: 100 of 5000 logs, 50 minutes left"
+    assert said[1:] == ["replaying: 412 of 5000 logs, 83 M rows, 9 minutes left, 1 worker lost"]
+
+
+@pytest.mark.parametrize(("count", "words"), [(999, "999 rows"), (12_345, "12 k rows"), (2_100_000_000, "2 G rows")])
+def test_rows_in_three_digits(count: int, words: str) -> None:
+    assert words in CrewLines(lambda: 0.0).words(CrewProgress("replaying", 1, 2, count, 3 * count))
+
+
+def test_the_hint_is_given_where_it_helps() -> None:
+    assert hint(60.0, 8) == hint(61.0, 4) == []
+    assert hint(75.2, 8) == ["replaying took 75 s; `--cluster local` makes more of 8 cores: its workers are processes"]
+
+
+def test_without_dask_a_line_says_what_to_type() -> None:
+    code = (
+        "import sys; sys.modules['distributed'] = None; from copem_replay.cli.main import main;"
+        "sys.argv = ['copem-replay', 'run', 'logs/tc016d.yaml', '--cluster', 'local']; main()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert ended.returncode == 2
+    assert ended.stderr == "--cluster: Dask is not installed: pip install 'copem-replay[cluster]'\n"
