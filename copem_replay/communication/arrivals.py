@@ -1,8 +1,8 @@
-"""The receiver's instants: when it issues a fused list, and which lists it then goes by.
+"""The receiver's instants: when it issues a fused list, and which lists it then uses.
 
 It issues one at every instant at which at least one list arrives (within 1 µs is one instant), from each unit's newest
 list that has arrived, none older than `max_age_s`, counted from capture, on top of the list's own way to the receiver.
-A list that arrives after a newer one of its unit is not gone by.
+A list that arrives after a newer one of its unit is not used.
 """
 
 from __future__ import annotations

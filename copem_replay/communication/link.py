@@ -24,8 +24,8 @@ _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 class KeptDraws:
-    """What links drew for the lists of one log, run by run: several configurations send by a link, and what is said of
-    links goes by it once more. When there is no more room for it all is forgotten; it would only be drawn again.
+    """What links drew for the lists of one log, run by run: several configurations send by a link, and the columns
+    about links use the draws again. When there is no more room all is forgotten; it would only be drawn again.
     """
 
     def __init__(self, room_bytes: int = 64_000_000) -> None:
@@ -48,7 +48,7 @@ class KeptDraws:
 
 @dataclass(frozen=True)
 class Air:
-    """What else a link may go by, of lists (F,) in one run: their numbers, their ways, and how many entries each has.
+    """Further input of a link, of lists (F,) in one run: their numbers, their ways, and how many entries each has.
 
     `path`, `objects`: None where no link of the experiment asks for them. `kept`: what was drawn for these lists.
     """

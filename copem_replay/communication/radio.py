@@ -84,8 +84,8 @@ class Radio(LinkModel):
         if air is None:
             latency_s, arrives = self._drawn(lists)
         else:
-            whose = air.draws.rng, lists.units, air.draws.runs.tobytes()
-            latency_s, arrives = air.kept.of(self, whose, lambda: self._drawn(lists))
+            key = air.draws.rng, lists.units, air.draws.runs.tobytes()
+            latency_s, arrives = air.kept.of(self, key, lambda: self._drawn(lists))
         delay_s = waits_s + latency_s
         if self.order == "kept":
             delay_s = _in_order(lists, delay_s)

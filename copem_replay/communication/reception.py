@@ -1,4 +1,4 @@
-"""Reception models: does a list arrive at all? They return a probability and never draw."""
+"""Reception models: the probability that a list arrives. They never draw."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from copem_replay.core.tracks import Float
 NEAR_M = 3.0
 """Nearer than this it is no different (the log of a distance has no end)."""
 BLOCKED = 0.05
-"""Of whose receiver less than this shows, the way of a list is blocked (chosen)."""
+"""The way of a list is blocked where less than this share of its receiver shows (chosen)."""
 
 
 @dataclass(frozen=True)

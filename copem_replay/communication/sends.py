@@ -1,4 +1,4 @@
-"""What units send of what they list: how often, and which objects. docs/guide/sends.md.
+"""Messages of units: how often they are sent, and which objects are in them. docs/guide/sends.md.
 
 A message that leaves objects out is *partial*: an object left out is not gone. The rules of `kind: cpm` are those that
 open simulators of cooperative perception have; they were not checked against a standard.

@@ -1,4 +1,4 @@
-"""Does a latency or reception model of your own keep the rules? Ask in a test of yours.
+"""Checks of your own latency and reception models, for your tests.
 
 def test_mine():
     check_latency(Mine(kind="mine:Mine"))
@@ -19,7 +19,7 @@ LINK_RULES = {
     "alone": "a list has the same number, whichever others stand beside it",
     "order": "delays never decrease as the uniform number grows: they invert a distribution",
 }
-"""What `check_latency` and `check_reception` demand."""
+"""The rules of `check_latency` and `check_reception`."""
 
 
 class BrokenLinkRuleError(AssertionError):

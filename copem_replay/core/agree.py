@@ -1,4 +1,4 @@
-"""What class an entry is of, and which can be of one object: what two lists call it need not be the same word."""
+"""Classes of entries: the most probable one, and which classes of two lists can be of one object."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Optimal assignment where most pairs are ruled out: the pairs of least total cost, no row and no column twice.
 
-Whoever is left alone costs 0, so a pair of cost 0 or more is never chosen: callers take the price of leaving both
+A row or column left alone costs 0, so a pair of cost 0 or more is never chosen: callers take the price of leaving both
 alone off the cost of each pair. The price may differ between connected components of the pairs, which do not compete:
 `largest_around` is for that. A row and a column that are each other's only choice are settled at once; the rest is
 solved row after row by shortest augmenting paths over the allowed pairs, which never leave the row's connected
@@ -131,7 +131,7 @@ def _augment(start: Int, choice: Int, price: Float, n: int, m: int, partner: Int
         done = count = 0
         i, free, reached, out, leaving = new, -1, 0.0, np.inf, new
         while True:
-            # Strictly: nobody leaves for a newcomer with which the total does not fall.
+            # Strictly: no row gives way to a newcomer with which the total does not fall.
             if reached - u[i] < out:
                 out, leaving = reached - u[i], i
             offset = reached - u[i]

@@ -1,4 +1,4 @@
-"""How near do two boxes come to each other? Compiled: the ego along its path, the other along its recorded motion.
+"""The smallest distance of two moving boxes. Compiled: the ego along its path, the other along its recorded motion.
 
 All is piecewise linear: the ego's way between instants, its path between vertices, the other's motion between instants.
 A pose is (x, y, yaw), a size is (length, width); T instants, V path vertices, R courses of the ego.

@@ -23,12 +23,12 @@ VARIABLE = "NUMBA_CACHE_DIR"
 
 @cache
 def cache_note() -> str | None:
-    """Prepare the place for compiled code, once. Returns what has to be said of it: None, nothing."""
+    """Prepare the place for compiled code, once. Returns a note for the user, or None."""
     return prepare_cache(Path(__file__).parents[1])
 
 
 def prepare_cache(package: Path, environment: Mapping[str, str] = os.environ) -> str | None:
-    """Have a place for compiled code, before Numba is imported. Returns what has to be said of it: None, nothing."""
+    """Have a place for compiled code, before Numba is imported. Returns a note for the user, or None."""
     folders = _folders(package)
     _remove_stale(folders)
     if _writable(environment.get(VARIABLE)) or all(_writable(f"{folder}/__pycache__") for folder in folders):
@@ -76,7 +76,7 @@ def _writable(folder: str | None) -> bool:
 
 
 def _own_folder() -> tuple[str, str]:
-    """A folder that nobody else can write, and what is odd about it. Raises OSError."""
+    """A folder that no other user can write, and what is odd about it. Raises OSError."""
     import atexit
     import shutil
     import tempfile

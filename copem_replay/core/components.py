@@ -53,17 +53,17 @@ P = TypeVar("P")
 M = TypeVar("M", bound=BaseModel)
 _FORM = Discriminator(lambda value: "mapping" if isinstance(value, dict | BaseModel) else "plain")
 Either = Annotated[Annotated[P, Tag("plain")] | Annotated[M, Tag("mapping")], _FORM]
-"""Either of two; errors are about that whose form the value has."""
+"""A union of two models; errors name the one whose form the value has."""
 
 
 class Component(Frozen):
-    """Base of all components, ours and the users' own."""
+    """Base of all components, built-in and users' own."""
 
     kind: str
 
 
 class GivenError(TypeError):
-    """A method of a component gave something else than it should: which one, and what."""
+    """A method of a component returned a wrong value: its name, and the value."""
 
     def __init__(self, method: str, message: str) -> None:
         super().__init__(f"{method}: {message}")
@@ -71,7 +71,7 @@ class GivenError(TypeError):
 
 
 def asked(component: Component, where: str, work: Callable[[], T]) -> T:
-    """What a component answers. Raises InputError where a user's own one fails; a failure of ours stays a defect."""
+    """The answer of a component. Raises InputError where a user's own fails; a built-in one's is a defect."""
     try:
         return work()
     except FAILURES as error:
@@ -83,7 +83,7 @@ def asked(component: Component, where: str, work: Callable[[], T]) -> T:
 
 
 def wrong(component: Component, where: str, message: str, *methods: str) -> InputError:
-    """The error that what a component gave is wrong, with file and line of the first of these methods that is own."""
+    """The error for a wrong answer of a component, with file and line of the first of these methods that is own."""
     return InputError(f"{where}: {component.kind}: {message}{written_at(type(component), *methods)}")
 
 
@@ -217,7 +217,7 @@ class Slot:
         return component
 
     def build(self, value: object, context: Mapping[str, Any] | None = None) -> Component:
-        """A component from what the experiment says of it. `context`: what validators are told, such as the folder."""
+        """A component from its keys in the experiment. `context`: given to validators, such as the folder."""
         if isinstance(value, Component):
             return value
         if self.default is not None and isinstance(value, Mapping) and "kind" not in value:
@@ -238,7 +238,7 @@ class Slot:
 
 
 def at_key(key: str, message: str) -> ValidationError:
-    """The error that what stands at a key of a model is wrong, for the model's own validators to raise."""
+    """The error for a wrong value at a key of a model, for the model's own validators to raise."""
     return ValidationError.from_exception_data("key", [{"type": _problem(message), "loc": (key,), "input": key}])
 
 

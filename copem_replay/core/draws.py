@@ -1,7 +1,7 @@
-"""What a unit's draws are made of: parts that last, and a rest that is new in every list.
+"""Draws of a unit: parts that last, and a rest that is new in every list.
 
-Normals are sums, z = Σ √shareᵢ nᵢ + √(1 − Σ shareᵢ) n_fresh, uniforms mixtures: an addressed choice says by which part
-a list goes. Either way the law in one list stays what it is without memory. Addresses beside those of fresh numbers:
+Normals are sums, z = Σ √shareᵢ nᵢ + √(1 − Σ shareᵢ) n_fresh, uniforms mixtures: an addressed choice names the part that
+a list uses. Either way the law in one list stays what it is without memory. Addresses beside those of fresh numbers:
 `<name> <of> <number> held` and `… drifts`, with `of` as in a part, and `<name> part` for the choice.
 """
 
@@ -28,7 +28,7 @@ _LOWEST = 2.0**-53
 class Draws:
     """Numbers for rows (P,) of the lists of units, in the runs (S,).
 
-    `random_key (P,)`: whose they are; `lists`: all lists of these units, and in which each row is.
+    `random_key (P,)`: their addresses; `lists`: all lists of these units, and the list of each row.
     """
 
     rng: CounterRng

@@ -13,7 +13,7 @@ from copem_replay.core.scratch import flush, flush_all, scratch_for
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Where to write what is to become `path`: it gets its name when all went well, and goes when anything did not.
+    """The path to write `path` at: it gets its name when all went well, and is removed when anything did not.
 
     Missing folders are made. Raises OutputError when it cannot be written.
     """

@@ -1,4 +1,4 @@
-"""The receiver's fused tracks in one run or several: for writing, for showing, and for what they imply."""
+"""The receiver's fused tracks in one run or several: for files, for display, and for perceived conflicts."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class FusedTracks:
 
     @cached_property
     def first_unit_ix(self) -> Int:
-        """(S, P) of the units that contributed to each row the one whose list arrived first; −1: none, or not said."""
+        """(S, P) the unit of each row whose contribution arrived first; −1: none, or not stated."""
         if self.said is not None:
             return np.asarray(self.said["unit_ix"], dtype=np.int64)[None]
         return self._newest_and_first[1]
@@ -134,7 +134,7 @@ class FusedTracks:
         return place
 
     def names_of(self, scene: Scene) -> tuple[list[str], Int]:
-        """Names, and (P,) which of them each row goes by.
+        """Names, and (P,) which of them is each row's.
 
         The id of the object a row is about, else the fusion's own identity for it, else its place in its list.
         """
@@ -172,7 +172,7 @@ class FusedTracks:
 
 @borrowing
 def newest_and_first(of: Sources, s: int, p: int) -> tuple[float, int]:
-    """Of row p in run s the newest capture, −inf: none, and the unit whose list arrived first, −1: none."""
+    """Row p in run s: the newest capture, −inf: none, and the unit whose list arrived first, −1: none."""
     newest_s, first, best_s = -np.inf, -1, np.inf
     for c in range(of.start[p], of.start[p + 1]):
         entry = of.entries[c]

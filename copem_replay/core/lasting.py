@@ -23,7 +23,7 @@ from copem_replay.core.random import CounterRng, RandomKey, Words, stable_hash
 from copem_replay.core.tracks import Bool, Float, Int
 
 Of = Literal["pair", "unit", "object", "all"]
-"""Who has a number in common: one unit and object, all objects of a unit, all units of an object, everybody."""
+"""The rows that share a number: one unit and object, all objects of a unit, all units of an object, all rows."""
 
 LEAF = 27
 """Leaves of a path are 2^27 ns, 134 ms (chosen: it changes cost and the path, not the law)."""
@@ -35,9 +35,9 @@ FORGOTTEN = 37.0
 
 @dataclass(frozen=True)
 class ListTimes:
-    """The lists of units, all of a log's: `stamp_ns (F,)` unit by unit and ascending, `unit_ix (F,)` whose they are.
+    """The lists of units, all of a log's: `stamp_ns (F,)` unit by unit and ascending, `unit_ix (F,)` the unit of each.
 
-    `frame_ix (P,)`: in which of them each row is.
+    `frame_ix (P,)`: the list of each row.
     """
 
     stamp_ns: Int
@@ -69,8 +69,8 @@ def shared(random_key: RandomKey, of: Of) -> RandomKey:
     if of in ("object", "all"):
         random_key = replace(random_key, units=("",), unit_ix=np.zeros(len(random_key.stamp_ns), dtype=np.int64))
     if of in ("unit", "all"):
-        everyone = np.full(len(random_key.stamp_ns), stable_hash("everyone"), dtype=np.uint64)
-        random_key = replace(random_key, object_word=everyone)
+        of_all = np.full(len(random_key.stamp_ns), stable_hash("everyone"), dtype=np.uint64)
+        random_key = replace(random_key, object_word=of_all)
     return random_key
 
 
@@ -196,8 +196,8 @@ def dwelling(rng: CounterRng, purpose: str, random_key: RandomKey, runs: Int, la
     )
     stamp = random_key.stamp_ns
     from_ns, until_ns = int(stamp.min() - FORGOTTEN * lasts_s * 1e9), int(stamp.max()) + 1
-    nobody = np.zeros(series.shape[1], dtype=np.int64)
-    of_series = RandomKey(random_key.units, series[0].astype(np.int64), series[1], nobody)
+    zeros = np.zeros(series.shape[1], dtype=np.int64)
+    of_series = RandomKey(random_key.units, series[0].astype(np.int64), series[1], zeros)
     found = births(rng, purpose, of_series, runs, every_s=lasts_s, lasts_s=lasts_s, from_ns=from_ns, until_ns=until_ns)
     life_ns = (found.gone_ns - found.born_ns).astype(float)
     for s in range(len(runs)):

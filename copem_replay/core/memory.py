@@ -27,9 +27,9 @@ class Part(Frozen):
     """A part of a quantity's draws that lasts.
 
     `share`: of the variance where normals are drawn (errors), of the lists where uniforms are (detection).
-    `correlation_s`: how long. `of`: who has the number in common: one unit and object, all objects of a unit, all units
-    of an object, everybody. `path`: whether it is `held` and then another, or `drifts`; left out, uniforms are held and
-    normals drift.
+    `correlation_s`: how long. `of`: the rows that share the number: one unit and object, all objects of a unit, all
+    units of an object, all rows. `path`: whether it is `held` and then another, or `drifts`; left out, uniforms are
+    held and normals drift.
     """
 
     share: Share

@@ -1,4 +1,4 @@
-"""Object lists without truth: what a fusion sees, and what it gives.
+"""Object lists without truth: the input and output of fusions.
 
 An *entry* is one object in one list, as a receiver has it: never with a truth id. Lists are NumPy arrays of the record
 type `ENTRY`, so `entries["x_m"]` is a column and `entries[mask]` a shorter list. Letters: S runs, F lists of units,
@@ -30,11 +30,11 @@ ENTRY = np.dtype(
         ("cov_ee_m2", "f8"),  # position covariance, easting and northing: positive definite
         ("cov_en_m2", "f8"),
         ("cov_nn_m2", "f8"),
-        ("existence", "f8"),  # probability that there is an object, as whoever lists it claims
+        ("existence", "f8"),  # probability that there is an object, as the list claims
         ("class_probability", "f8", (len(CLASSES),)),  # by index into CLASSES
         ("captured_s", "f8"),  # in a unit's list: the list's; in a fused one: the newest that contributed
-        ("unit_ix", "i8"),  # in a unit's list: whose; in a fused one: of those that contributed the first, −1: not said
-        ("track_id", "i8"),  # as whoever lists it keeps tracks, −1: keeps none
+        ("unit_ix", "i8"),  # in a unit's list: that unit; in a fused one: the first contributor, −1: not stated
+        ("track_id", "i8"),  # the track id that the list states, −1: none
     ]
 )
 """One entry of an object list."""
@@ -45,7 +45,7 @@ Entries = NDArray[Any]
 """(N,) of ENTRY."""
 
 TellsOf = Literal["capture", "now"]
-"""Of which instant an entry tells: of its newest capture, or of the instant its list is available."""
+"""The instant that an entry tells of: its newest capture, or the instant its list is available."""
 
 
 def taken(entries: Entries, rows: Int) -> Entries:
@@ -105,10 +105,10 @@ class Inputs:
 
     List f is the same capture of the same unit in all runs; what is in it differs from run to run. Entries of one list
     are in a random order that is the same however the recording was ordered. Times are seconds since the log's start.
-    They are what `ListFusion.fuse` is handed.
+    `ListFusion.fuse` takes them.
 
-    Of a unit whose messages leave objects out that are still there, `newest` says a list that is not among those that
-    `arrived`: what is known of it, the newest entry of each object, each with its own `captured_s`.
+    For a unit with partial messages `newest` names a list that is not among those that `arrived`: the newest entry of
+    each of its objects, each with its own `captured_s`.
 
     >>> none = np.zeros(0, dtype=int)
     >>> lists = cr.ObjectLists(np.array([[0]]), cr.entries_of(0))
@@ -118,7 +118,7 @@ class Inputs:
     """
 
     units: tuple[str, ...]  # U
-    unit_ix: Int  # (F,) whose list
+    unit_ix: Int  # (F,) the unit of each list
     captured_s: Float  # (F,)
     arrives_s: Float  # (F,) inf: never
     lists: ObjectLists  # of the units: F lists in each of S runs

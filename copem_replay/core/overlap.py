@@ -1,4 +1,4 @@
-"""How much do two boxes overlap, seen from above?"""
+"""The overlap of two boxes, seen from above."""
 
 from __future__ import annotations
 

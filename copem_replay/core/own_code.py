@@ -1,6 +1,6 @@
-"""Code of a user's own that fails or gives something wrong: which line of which file it is.
+"""Failures and wrong answers of a user's own code: the file and the line.
 
-For components that an experiment names (`kind: package.module:Class`). A failure of ours is a defect and stays one.
+For components that an experiment names (`kind: package.module:Class`). A failure of built-in code stays a defect.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 FAILURES = (Exception, SystemExit)
-"""What code of a user's may end with; an interrupt is not its doing."""
+"""Exceptions that a user's code may raise; an interrupt is none of them."""
 
 
 def is_own(component: type[Any]) -> bool:
-    """Whether a class is a user's, not ours."""
+    """Whether a class is a user's own, not built in."""
     return not component.__module__.startswith("copem_replay.")
 
 
@@ -33,7 +33,7 @@ def failed(error: BaseException, component: type[Any] | None = None) -> str:
 
 
 def written_at(component: type[Any], *methods: str) -> str:
-    """` (file:line)` of the first of some methods that is a user's own, else of the class; empty for ours."""
+    """` (file:line)` of the first of some methods that is a user's own, else of the class; empty for built-in ones."""
     if not is_own(component):
         return ""
     for name in methods:
@@ -58,5 +58,5 @@ _MACHINERY = (f"{Path(__file__).parents[1]}{os.sep}", f"{Path(importlib.__file__
 
 
 def _is_machinery(file: str) -> bool:
-    """Whether a file is ours or Python's import: no line that a user wrote."""
+    """Whether a file is of this package or Python's import, not a user's."""
     return file.startswith(_MACHINERY)

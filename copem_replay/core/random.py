@@ -2,7 +2,7 @@
 
 No number is taken from a stream: each is computed from its address, (seed, log, purpose, unit, run; object,
 capture stamp). So a run alone equals the same run in a batch, adding a unit or a configuration leaves all other
-draws as they were, and every configuration sees the same dice.
+draws as they were, and all configurations use common random numbers.
 
 Generator: Philox4x32-10 (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
 Key: a 64-bit hash of (seed, log, purpose, unit), its low word xor the run. Counter: 64-bit hash of the object's
@@ -40,9 +40,9 @@ def object_words(object_ids: Sequence[str]) -> Words:
 
 @dataclass(frozen=True)
 class RandomKey:
-    """Who the numbers are for, row by row: one number per run and row.
+    """Addresses of random numbers, row by row: one number per run and row.
 
-    `units` are the U names, `unit_ix (P,)` says whose row it is; `object_word (P,)` comes from `object_words`.
+    `units` are the U names, `unit_ix (P,)` is the unit of each row; `object_word (P,)` comes from `object_words`.
     """
 
     units: tuple[str, ...]
@@ -57,7 +57,7 @@ class RandomKey:
 
 @dataclass(frozen=True)
 class CounterRng:
-    """The dice of one log under one seed. Two logs never share theirs: the log's name is part of the address."""
+    """The random numbers of one log under one seed. Two logs never share any: the log's name is part of the address."""
 
     seed: int
     log: str

@@ -1,6 +1,6 @@
 """Files elsewhere: URLs that fsspec opens. Nothing of it is loaded where all files are on this machine.
 
-What lets us in (endpoints, profiles, keys) is in fsspec's own environment and files, never in an experiment; a URL is
+Access data (endpoints, profiles, keys) are in fsspec's own environment and files, never in an experiment; a URL is
 written and said without its user and its query.
 """
 
@@ -37,7 +37,7 @@ class Remote:
 
     @property
     def path(self) -> PurePosixPath:
-        """What it is called there, from the bucket or host on."""
+        """Its path there, from the bucket or host on."""
         return PurePosixPath("/" + str(self).partition("://")[2])
 
     @property
@@ -47,7 +47,7 @@ class Remote:
 
     @cached_property
     def there(self) -> Mapping[str, Any] | None:
-        """What its file system says of it; None: there is no such file. Raises InputError: it cannot be asked."""
+        """Its entry in the file system; None: there is no such file. Raises InputError: it cannot be asked."""
         if self.info is not None:
             return self.info
         fs, path = file_system(self.url)

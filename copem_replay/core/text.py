@@ -38,7 +38,7 @@ def interval_words(kind: str, over: str) -> str:
 
 
 def unknown(what: str, name: object, known: Iterable[str]) -> str:
-    """That nothing bears a name, and which there are, or which was meant."""
+    """A message that a name is unknown, with the names there are, or the likely one."""
     names = list(dict.fromkeys(known))
     near = difflib.get_close_matches(str(name), names, n=1)
     hint = f"; did you mean {near[0]}?" if near else f"; there {'are ' + ', '.join(names) if names else 'are none'}"

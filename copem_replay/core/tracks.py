@@ -1,4 +1,4 @@
-"""Tracks and Scene: the type that flows. Read this first.
+"""Tracks and Scene: the types that all wings exchange. Read this first.
 
 A log is a bag of tracks. `Tracks` is ragged: its rows are the entries of a sparse matrix tracks × frames,
 stored track by track. A *track* is one object as one unit has it, a *frame* is one list of one unit, a *row*
@@ -49,7 +49,7 @@ CLASS_GROUPS = {
 """Names that stand for several classes (`vru`: vulnerable road users)."""
 
 NO_CAPTURE_NS = np.iinfo(np.int64).min
-"""Stamp of a fused list at an instant at which no list is recent enough to go by."""
+"""Stamp of a fused list at an instant at which no list is recent enough."""
 
 SAME_INSTANT_NS = 1_000
 """Two instants closer than this are one (1 µs, from the contract)."""
@@ -83,7 +83,7 @@ class Scene:
     object_class: NDArray[np.int8]  # (N,) index into CLASSES
     moving: Bool  # (N,)
     ego_ix: int = -1
-    ego_sized: bool = True  # False: nobody says how large the ego is, and gaps to it are not known
+    ego_sized: bool = True  # False: the size of the ego is not known, nor are gaps to it
 
     @cached_property
     def object_number(self) -> dict[str, int]:
@@ -160,7 +160,7 @@ class Tracks:
     def common_arrives_s(self) -> Float:
         """(F,) when each list arrives, in the one run there is, or in all alike. Raises ValueError where runs differ.
 
-        Whatever goes by it is asked for one run at a time.
+        Callers ask for one run at a time.
         """
         if len(self.arrives_s) != 1:
             raise ValueError(
@@ -291,7 +291,7 @@ def joined(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
 def spliced(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Tracks, Int]:
     """Rows of the same lists as one, and where each comes from: its place (P,) in the pieces one after the other.
 
-    `states=False`: nobody will ask for them, they are 0.
+    `states=False`: states are not needed, they are 0.
     """
     unit_ix, object_ix, frame_ix = (
         np.concatenate([getattr(piece, name) for piece in pieces])

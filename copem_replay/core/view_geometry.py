@@ -1,4 +1,4 @@
-"""What passes between the engine and the models of a PEM."""
+"""Types that the engine and the models of a PEM exchange."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Noise = Callable[[str], Float]
 
 @dataclass(frozen=True)
 class ViewGeometry:
-    """The view of each candidate row from its unit. All (P,); nothing here depends on the run.
+    """The view of each observation from its unit. All (P,); nothing here depends on the run.
 
     `observations` gives the same as a table.
 

@@ -82,7 +82,7 @@ _CORE: tuple[tuple[re.Pattern[str], Any], ...] = (
 
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./:+-]*[A-Za-z0-9_./]|[A-Za-z]")
-"""Text that nobody takes for anything else, in a list or out of it: written without quotes if it is no number."""
+"""Text that has no other meaning in YAML, in a list or out of it: written without quotes if it is no number."""
 
 
 def _core(text: str) -> Any:
@@ -187,7 +187,7 @@ def _quoted(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Noted:
-    """A value with what is said of it behind, on its line."""
+    """A value with a comment behind it, on its line."""
 
     value: Any
     words: str
@@ -217,7 +217,7 @@ def _block(value: Any) -> list[str]:
 
 
 def _noted(value: Any) -> bool:
-    """Whether anything in a value is."""
+    """Whether anything in a value is `Noted`."""
     if isinstance(value, Mapping):
         return any(map(_noted, value.values()))
     return isinstance(value, Noted) or (isinstance(value, list | tuple) and any(map(_noted, value)))

@@ -44,7 +44,7 @@ class ListFusion(Fusion):
 
     resumable: ClassVar[bool] = False
     """Whether `resume` gives, chunk after chunk of the instants, the very lists of `fuse`; if not, all instants are
-    handed over at once. Whoever overrides `fuse` has to say so anew."""
+    handed over at once. A class that overrides `fuse` has to declare it anew."""
 
     tells_of: ClassVar[TellsOf] = "capture"
     """Whether an entry shows the object as it was at its newest capture, or brought to the instant of the list (`now`).
@@ -69,7 +69,7 @@ class ListFusion(Fusion):
         """Which lists that arrived before a time chunk it needs once more, beside those in `newest`.
 
         Those captured at most so long before the newest capture that had arrived by then: the others have no entries.
-        It is from that capture that it counts, not from the time chunk's first instant, since all lists may come late.
+        It counts from that capture, not from the time chunk's first instant, since all lists may come late.
         """
         return 0.0
 
@@ -266,7 +266,7 @@ def inbox_at(inputs: Inputs, run: int, instant: int) -> Inbox:
     """What the receiver has at one instant of one run."""
 
     def one(f: int) -> UnitList:
-        entries = inputs.lists.of(run, f).copy()  # whoever changes it changes his own
+        entries = inputs.lists.of(run, f).copy()  # a caller that changes it changes a copy
         return UnitList(
             inputs.units[inputs.unit_ix[f]], float(inputs.captured_s[f]), float(inputs.arrives_s[f]), entries
         )

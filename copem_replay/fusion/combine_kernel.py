@@ -1,7 +1,7 @@
 """Clusters of entries combined where errors hang together: position and covariance of each, from all its members.
 
-Members stand in an order that only their content decides (fusion/gnn_kernel.py), so those who combine one after the
-other may do so as they stand.
+Members stand in an order that only their content decides (fusion/gnn_kernel.py), so methods that combine one after the
+other may take them as they stand.
 """
 
 from __future__ import annotations

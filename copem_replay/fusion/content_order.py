@@ -1,4 +1,4 @@
-"""An order of entries that depends on what they say only: not on the order they came in, nor on whose they are."""
+"""An order of entries by their content alone: neither the order they came in nor their units matter."""
 
 from __future__ import annotations
 

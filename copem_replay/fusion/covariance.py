@@ -148,12 +148,12 @@ def _combined(x: Float, cov: Float, information: Float, weight: Float) -> tuple[
 # weight score 1, and none scores more (J. Kiefer, J. Wolfowitz, "The equivalence of two extremum problems", Canadian
 # Journal of Mathematics 12 (1960) 363–366; scores above 1 also bound what there is to gain).
 #
-# From equal weights: Newton steps among the inputs with weight. Whoever reaches 0 leaves; once those with weight have
-# one score, whoever scores most enters. J at the optimum is unique. Weights are not where informations depend on each
-# other (equal ones, or equal ones seen from many sides), and the mean goes by them: then they are shared out evenly.
-# Information is kept in coordinates in which J = 1, and B (d, d), of norm 1, is what the criterion weighs there: 1/√d
-# for the determinant, L⁻¹ in proportion for the trace, with LLᵀ = J. Then scores are ⟨IᵢB, B⟩, and curvatures
-# ⟨IᵢB, IⱼB⟩, twice for the trace.
+# From equal weights: Newton steps among the inputs with weight. An input that reaches 0 leaves; once those with weight
+# have one score, the input that scores most enters. J at the optimum is unique. Weights are not where informations
+# depend on each other (equal ones, or equal ones seen from many sides), and the mean goes by them: then they are shared
+# out evenly. Information is kept in coordinates in which J = 1, and B (d, d), of norm 1, is what the criterion weighs
+# there: 1/√d for the determinant, L⁻¹ in proportion for the trace, with LLᵀ = J. Then scores are ⟨IᵢB, B⟩, and
+# curvatures ⟨IᵢB, IⱼB⟩, twice for the trace.
 
 
 @nb.njit(cache=True, nogil=True)

@@ -37,12 +37,12 @@ class Gnn(ListFusion):
 
     List after list, newest capture first, the entries are assigned to the clusters so far at least total cost d² +
     ln|S|, S = P_cluster + P_entry, where d² = νᵀS⁻¹ν is within `gate` (the share of true pairs inside: χ², two degrees
-    of freedom) and the classes agree; whoever is left founds a cluster. No unit is twice in one. The members' positions
-    are combined by `combine`: inverse variance (independent errors) or covariance intersection (any correlation; of
-    least trace or, `minimise`, determinant), in closed form if fast, which gives the best member where that is better;
-    inverse covariance intersection (common information, counted once); split covariance intersection (a part of each
-    stated covariance, `dependent_share`, or `dependent_m2` per axis, hangs together in whatever way, the rest is
-    independent); cross covariance (every two errors are correlated by `correlation`); covariance union (inverse
+    of freedom) and the classes agree; an entry that is left founds a cluster. No unit is twice in one. The members'
+    positions are combined by `combine`: inverse variance (independent errors) or covariance intersection (any
+    correlation; of least trace or, `minimise`, determinant), in closed form if fast, which gives the best member where
+    that is better; inverse covariance intersection (common information, counted once); split covariance intersection (a
+    part of each stated covariance, `dependent_share`, or `dependent_m2` per axis, hangs together in whatever way, the
+    rest is independent); cross covariance (every two errors are correlated by `correlation`); covariance union (inverse
     variance, but clusters whose classes agree and whose boxes overlap, no list having both, are one object in conflict:
     what lies beyond `conflict_gate` of the others is united with them, so that whichever is right is covered).
     Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height, velocity, size and yaw (on the circle) the
@@ -74,7 +74,7 @@ class Gnn(ListFusion):
     @model_validator(mode="before")
     @classmethod
     def _said(cls, given: Any) -> Any:
-        """What is not said of the keys of one way to combine, so that an experiment that is written back says it."""
+        """Defaults of the keys of one way to combine, so that an experiment that is written back has them."""
         if not isinstance(given, dict):
             return given
         own = dict(_KEYS_OF.get(str(given.get("combine")), {}))

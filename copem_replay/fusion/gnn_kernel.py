@@ -23,7 +23,7 @@ from copem_replay.fusion.content_order import compare_rows, sort_rows
 from copem_replay.fusion.covariance import covariance_intersection, fast_covariance_intersection, floored
 
 WIDTH = 13 + len(CLASSES)
-"""So many numbers of an entry, from the first on, speak of the object; the rest of who says it when."""
+"""So many numbers of an entry, from the first on, describe the object; the rest are times and ids."""
 assert list(ENTRY.names or ())[13:15] == ["class_probability", "captured_s"]
 
 _OPPOSED = 1e-9
@@ -44,7 +44,7 @@ Points = NDArray[Any]
 
 
 class Clusters(NamedTuple):
-    """Who is in which cluster of which instant, in one run."""
+    """The entries of each cluster of each instant, in one run."""
 
     start: Int  # (K + 1,) where the clusters of each instant begin
     begin: Int  # (clusters + 1,) where the members of each begin
@@ -193,7 +193,7 @@ def _list_before(
     return bool(arrives_s[f] < arrives_s[g])
 
 
-# ---------------------------------------------------------------- who belongs together
+# ---------------------------------------------------------------- association
 
 
 @nb.njit(cache=True, nogil=True)
@@ -274,7 +274,7 @@ def _sort_by_x(clusters: Points, by_x: Int) -> None:
 
 @nb.njit(cache=True, nogil=True)
 def _group(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
-    """Enters who joined into `member` cluster by cluster, those of c between `begin[c]`, given for 0, and the next."""
+    """Enters joined entries into `member`: those of c between `begin[c]`, given for 0, and the next."""
     count = len(begin) - 1
     for c in range(count):
         begin[c + 1] = 0
@@ -310,7 +310,7 @@ def write_entry(
     out.x_m, out.y_m = state.x_m, state.y_m
     out.cov_ee_m2, out.cov_en_m2, out.cov_nn_m2 = state.ee, state.en, state.nn
     total = sin = cos = z = vx = vy = length = width = height = 0.0
-    nobody, newest_s, earliest_s = 1.0, -np.inf, np.inf
+    no_object, newest_s, earliest_s = 1.0, -np.inf, np.inf
     out.unit_ix = -1
     for i in members:
         point = points[i]
@@ -320,7 +320,7 @@ def write_entry(
         sin, cos = sin + w * np.sin(entry.yaw_rad), cos + w * np.cos(entry.yaw_rad)
         z, vx, vy = z + w * entry.z_m, vx + w * entry.vx_mps, vy + w * entry.vy_mps
         length, width, height = length + w * entry.length_m, width + w * entry.width_m, height + w * entry.height_m
-        nobody *= 1 - entry.existence
+        no_object *= 1 - entry.existence
         newest_s = max(newest_s, entry.captured_s)
         at_s = arrives_s[point.list]
         if at_s < earliest_s or (at_s == earliest_s and entry.unit_ix < out.unit_ix):
@@ -331,7 +331,7 @@ def write_entry(
     opposed = sin * sin + cos * cos < (_OPPOSED * total) ** 2
     yaw_rad = entries[points[members[0]].row].yaw_rad
     out.yaw_rad = np.arctan2(np.sin(yaw_rad), np.cos(yaw_rad)) if opposed else np.arctan2(sin, cos)
-    out.existence = 1 - nobody
+    out.existence = 1 - no_object
     for h in range(len(CLASSES)):
         out.class_probability[h] = class_sum[h] / len(members)
     out.captured_s, out.track_id = newest_s, -1

@@ -95,9 +95,9 @@ def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
 #
 # w ↦ (D/w + N)⁻¹ = w (D + wN)⁻¹ = J is concave, so trace and logarithm of the determinant of (Σ Jᵢ)⁻¹ are convex. The
 # *score* of an input is how fast the criterion falls as it gains weight. At the optimum, and only there, inputs with
-# weight have one score and none scores more. Newton steps among the inputs with weight, as in fusion/covariance.py:
-# whoever reaches 0 leaves; once those with weight have one score, whoever scores most enters. Any weights make a valid
-# P, so where the steps end before that is a matter of size, never of validity.
+# weight have one score and none scores more. Newton steps among the inputs with weight, as in fusion/covariance.py: an
+# input that reaches 0 leaves; once those with weight have one score, the input that scores most enters. Any weights
+# make a valid P, so where the steps end before that is a matter of size, never of validity.
 
 
 @nb.njit(cache=True, nogil=True)

@@ -42,7 +42,7 @@ class Said(NamedTuple):
     start: Int  # (F + 1,)
     rows: Int  # (N,) indices into entries
     entries: Entries  # (N,)
-    content: Float  # (N, D) the entries as numbers, without when and whose they are
+    content: Float  # (N, D) the entries as numbers, without times and ids
     captured_s: Float  # (F,)
     unit_ix: Int  # (F,)
 
@@ -370,7 +370,7 @@ def _comes_before(said: Said, f: int, g: int) -> bool:
         order = compare_rows(said.content, said.rows[said.start[f] + k], said.rows[said.start[g] + k])
         if order != 0:
             return bool(order < 0)
-    # They say the same: which of them is first only decides whose the track is said to be.
+    # They are equal: their order only decides which unit's the track counts as.
     return bool(said.unit_ix[f] < said.unit_ix[g] or (said.unit_ix[f] == said.unit_ix[g] and f < g))
 
 

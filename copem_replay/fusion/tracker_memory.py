@@ -27,7 +27,7 @@ TRACK = np.dtype(
         ("count", "i8"),  # of entries
         ("first_s", "f8"),  # captures of the first and the last list in support
         ("last_s", "f8"),
-        ("unit_ix", "i8"),  # who founded it
+        ("unit_ix", "i8"),  # the unit that founded it
         ("track_id", "i8"),
     ]
 )  # fmt: skip

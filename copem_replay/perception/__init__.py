@@ -1,1 +1,1 @@
-"""What each unit lists: where it stands, what it can see, which error it makes (PEM)."""
+"""Lists of units: where each unit stands, what it can see, which errors it makes (PEM)."""

@@ -1,4 +1,4 @@
-"""What entries say beside their states: how sure the unit is, what it takes the object for, and its own track id.
+"""Claims of entries beside their states: existence, class probabilities, and the unit's own track id.
 
 Where nothing of it is drawn it is the same in all runs; what is drawn is asked for one run at a time.
 """

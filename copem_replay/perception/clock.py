@@ -21,10 +21,10 @@ def clock_errors_s(
     clocks = {name: unit.clock for name, unit in setup.modelled.items() if unit.clock is not None and name in units}
     if not clocks:
         return None
-    rng, nobody = CounterRng(setup.seed, scene.log), np.zeros(1, dtype=np.int64)
+    rng, zero = CounterRng(setup.seed, scene.log), np.zeros(1, dtype=np.int64)
     error_s = np.zeros(len(captured_s))
     for name, clock in clocks.items():
-        random_key = always(shared(RandomKey((name,), nobody, nobody.astype(np.uint64), nobody), "unit"))
+        random_key = always(shared(RandomKey((name,), zero, zero.astype(np.uint64), zero), "unit"))
         [[offset]] = rng.normal("clock offset", random_key, np.array([run]))
         [[drift]] = rng.normal("clock drift", random_key, np.array([run]))
         mine = unit_ix == units.index(name)

@@ -1,8 +1,8 @@
-"""Ghosts in the lists of units: entries about nobody, which are born, last for a while and are gone.
+"""Ghosts in the lists of units: entries about no object, which are born, last for a while and are gone.
 
-Births are Poisson points in time, so how many there are and how long they last does not depend on the list rate. What
-is drawn of one has an address of its own; it is listed like an object: with the error of the couple that applies where
-it is, and moved by the unit's pose error. A ghost stands: in the frame of the unit, in the world, or beside its object.
+Births are Poisson points in time, so how many there are and how long they last does not depend on the list rate. Draws
+of a ghost have addresses of their own; it is listed like an object: with the error of the couple that applies where it
+is, and moved by the unit's pose error. A ghost stands: in the frame of the unit, in the world, or beside its object.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ assert tuple(SIZES_M) == CLASSES
 class GhostRows:
     """The ghosts in the lists of one run, row by row (P,): as observations of no object, which are all listed.
 
-    `words`: their addresses. `sort`: the place of each in its PEM's `ghosts`. `couple_ix`: whose error each has, the
-    one that applies where it is, else the first.
+    `words`: their addresses. `sort`: the place of each in its PEM's `ghosts`. `couple_ix`: the couple whose error each
+    has, the one that applies where it is, else the first.
     """
 
     found: Observations
@@ -150,7 +150,7 @@ def _born(
 
 @dataclass(frozen=True)
 class _Hosts:
-    """Beside whom ghosts are, (H,) words, and the row of each in each list (H, L), −1: none; None: beside nobody."""
+    """The objects beside ghosts: words (H,), and the row of each in each list (H, L), −1: none; None: no objects."""
 
     words: Words
     row: Int | None
@@ -158,9 +158,9 @@ class _Hosts:
 
 def _hosts(scene: Scene, found: Observations, lists: _Lists, sort: Ghosts) -> _Hosts:
     if not isinstance(sort.where, Beside):
-        nobody = np.zeros(1, dtype=np.int64)
-        everyone = shared(RandomKey((lists.name,), nobody, nobody.astype(np.uint64), nobody), "unit")
-        return _Hosts(everyone.object_word, None)
+        zero = np.zeros(1, dtype=np.int64)
+        of_all = shared(RandomKey((lists.name,), zero, zero.astype(np.uint64), zero), "unit")
+        return _Hosts(of_all.object_word, None)
     tracks = found.tracks
     of_class = np.isin(found.view.class_ix, class_indices(sort.where.classes)) & (found.probability > 0)
     rows = np.flatnonzero((tracks.row_unit_ix == lists.unit_ix) & of_class)
@@ -252,8 +252,8 @@ def _as_tracks(true: Tracks, lists: _Lists, born: _Born, values: dict[str, Float
 
 
 def _none(found: Observations) -> GhostRows:
-    nobody = found.take_rows(np.empty(0, dtype=np.int64))
-    return GhostRows(nobody, np.empty(0, dtype=np.uint64), np.empty(0, dtype=np.int64))
+    none = found.take_rows(np.empty(0, dtype=np.int64))
+    return GhostRows(none, np.empty(0, dtype=np.uint64), np.empty(0, dtype=np.int64))
 
 
 def _joined(pieces: Sequence[GhostRows]) -> GhostRows:

@@ -1,4 +1,4 @@
-"""Who could be listed: every object in every list of every unit, and how it looks from there.
+"""Observations: every object in every list of every unit, and its view geometry from there.
 
 Nothing here depends on the run, on a model's parameters or on a configuration: computed once per log and shared.
 """

@@ -1,6 +1,6 @@
 """Pose errors: a unit takes itself to be elsewhere, and turned. All of a list shifts and turns alike.
 
-Who is seen, and what hides it, follows the true pose; what is listed follows the one that the unit takes for its own:
+Visibility follows the true pose; lists follow the pose that the unit takes for its own:
 x' = x + δ + (R(δθ) − 1)(x − p), yaw' = yaw + δθ, v' = R(δθ) v, with p the true place of the unit.
 """
 
@@ -82,10 +82,10 @@ def _stating(seen: Tracks, rows: Int, from_unit_m: Float, placed: PoseError) -> 
 
 
 def _drawn(
-    scene: Scene, seen: Tracks, frames: Int, placed: PoseError, whose: tuple[int, str, Int]
+    scene: Scene, seen: Tracks, frames: Int, placed: PoseError, address: tuple[int, str, Int]
 ) -> tuple[Float, Float, Float]:
-    """Easting, northing (m) and heading (rad) of some lists of a unit: (S, K) each. `whose`: seed, unit, runs."""
-    seed, name, runs = whose
+    """Easting, northing (m) and heading (rad) of some lists of a unit: (S, K) each. `address`: seed, unit, runs."""
+    seed, name, runs = address
     mine = np.flatnonzero(seen.frame_unit_ix == seen.units.index(name))
     lists = ListTimes(seen.stamp_ns[mine], np.zeros(len(mine), dtype=np.int64), np.searchsorted(mine, frames))
     of_unit = np.zeros(len(frames), dtype=np.int64)

@@ -170,11 +170,11 @@ def place_obstacles(truth: Tracks, obstacles: tuple[Obstacle, ...], notes: list[
     return statics(polygons, grounds, [o.height_m for o in obstacles])
 
 
-def _ground(truth: Tracks, given_m: float | None, corners: Float, who: str, notes: list[str]) -> float:
+def _ground(truth: Tracks, given_m: float | None, corners: Float, unit: str, notes: list[str]) -> float:
     if given_m is not None:
         return given_m
     found = ground_at(truth, corners)
     if found is None:
-        notes.append(f"{who}: no object within {GROUND_WITHIN_M:g} m, ground taken as z = 0 (give ground_z_m)")
+        notes.append(f"{unit}: no object within {GROUND_WITHIN_M:g} m, ground taken as z = 0 (give ground_z_m)")
         return 0.0
     return found

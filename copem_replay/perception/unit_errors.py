@@ -1,4 +1,4 @@
-"""What a unit gets wrong beside its PEM: its own pose, its clock, and that for a while it makes no lists. Keys.
+"""Errors of a unit beside its PEM: its own pose, its clock, and outages. Keys.
 
 What comes of them: `pose_error.py`, `clock.py`, `outages.py`. docs/guide/unit-errors.md.
 """
@@ -40,7 +40,7 @@ class PoseError(Frozen):
 
 
 class Clock(Frozen):
-    """What a unit's clock is off by: an offset, and a drift since the log's start. Standard deviations over the runs.
+    """The error of a unit's clock: an offset, and a drift since the log's start. Standard deviations over the runs.
 
     Within a run both are constant. A fusion is told of captures by this clock.
     """

@@ -1,4 +1,4 @@
-"""What can be seen from where: the visible share of an upright box, exact to rounding.
+"""The visible share of an upright box, seen from a unit: exact to rounding.
 
 `surface`: uniform in azimuth over the target's angular extent; at each azimuth the share of the column of the
 target's nearest face, bottom to top, that no body in front of it covers. `flat`: the same with infinitely high

@@ -1,4 +1,4 @@
-"""Does a component of your own keep the rules? Ask in a test of yours.
+"""Checks of your own fusions, for your tests.
 
     def test_mine():
         check_fusion(Mine(kind="mine:Mine", radius_m=2.0))
@@ -33,7 +33,7 @@ FUSION_RULES = {
     "order of units": "units are in no order that means anything; if yours are, say units_in_any_order=False",
     "silence": "something is listed in some scene, or nothing has been checked",
 }
-"""What `check_fusion` demands."""
+"""The rules of `check_fusion`."""
 
 _TOLERANCE = 1e-9  # absolute or relative: in another order sums are rounded otherwise
 
@@ -144,14 +144,14 @@ class _Trial:
         """Whether the lists found of a scene are those of `first`: as sets, or to the last bit."""
         issue_s = scene.inputs().issue_s
         exact = rule in ("again", "runs", "chunks")
-        whose = np.array([*map((*self.scene.units, *scene.units).index, scene.units), -1])
+        unit_number = np.array([*map((*self.scene.units, *scene.units).index, scene.units), -1])
         for s, run in enumerate(scene.runs):
             called: dict[tuple[str, int], int] = {}
             for k, now_s in enumerate(issue_s[issue_s <= until_s].tolist()):
                 expected, one = first.of(run, k), found.of(s, k)
                 if exact and one.tobytes() == expected.tobytes():
                     continue
-                said = _difference(expected, with_columns(one, unit_ix=whose[one["unit_ix"]]), called)
+                said = _difference(expected, with_columns(one, unit_ix=unit_number[one["unit_ix"]]), called)
                 if said is None and exact:
                     said = "expected the bytes of the scene itself, found another order, other track ids or last digits"
                 if said is not None:

@@ -31,7 +31,7 @@ def needed_lists(captured_s: Float, at: FusionSchedule | Inputs, first: int, aft
     needed[at.arrived[begin:end]] = True
     before = at.arrived[:begin]
     if looks_back_s > 0 and len(before):
-        # Twice: whoever looks back has a tolerance of its own.
+        # Twice: a fusion that looks back has a tolerance of its own.
         oldest_s = captured_s[before].max() - looks_back_s - 2 * SAME_INSTANT_NS * 1e-9
         needed[before[captured_s[before] >= oldest_s]] = True
     return needed

@@ -28,7 +28,7 @@ _SCENES: tuple[tuple[str, int, int, float, int, float, float], ...] = (
 
 @dataclass(frozen=True)
 class SmallScene:
-    """Who says what and when: `said[s][f]` are the entries of list f in run `runs[s]`."""
+    """The lists of units: `said[s][f]` are the entries of list f in run `runs[s]`."""
 
     name: str
     units: tuple[str, ...]
@@ -44,8 +44,8 @@ class SmallScene:
         lists = [one for run in self.said for one in run]
         lengths = np.array([len(one) for one in lists], dtype=np.int64)
         start = np.append(0, np.cumsum(lengths))[np.arange(runs)[:, None] * count + np.arange(count + 1)]
-        whose, when = (np.repeat(np.tile(column, runs), lengths) for column in (self.unit_ix, self.captured_s))
-        entries = with_columns(np.concatenate([entries_of(0), *lists], dtype=ENTRY), unit_ix=whose, captured_s=when)
+        unit_ix, time_s = (np.repeat(np.tile(column, runs), lengths) for column in (self.unit_ix, self.captured_s))
+        entries = with_columns(np.concatenate([entries_of(0), *lists], dtype=ENTRY), unit_ix=unit_ix, captured_s=time_s)
         none, nothing = np.empty(0, dtype=np.int64), np.empty((1, 0))
         stamp_ns = np.rint(self.captured_s * 1e9).astype(np.int64)
         heard = Tracks(
@@ -113,7 +113,7 @@ def _scene(
     # Every other unit captures at the same instants.
     phase_s = np.where(np.arange(units) % 2 == 0, 0.0, rng.uniform(0.0, 0.1, units)) * (late_s > 0)
     captured_s = np.tile(np.arange(lists) * 0.1, units) + phase_s[unit_ix]
-    # Several at one instant, also of one unit; of two units never quite: the order of units is not to say who is first.
+    # Several at one instant, also of one unit; of two units never quite: the units' order must not matter.
     arrives_s = np.ceil((captured_s + rng.uniform(0.0, late_s, len(unit_ix))) / 0.05) * 0.05 + 5e-8 * unit_ix
     arrives_s[rng.random(len(unit_ix)) < lost] = np.inf
     place_m, speed_mps = rng.uniform(0.0, width_m, (2, n)), rng.normal(0.0, 3.0, (2, n))

@@ -1,4 +1,4 @@
-"""Classes: what units take objects for, and how sure they say they are of it."""
+"""Classes that units list objects as, and the probabilities that they state."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Shares = Annotated[dict[OneClass, Share], Field(min_length=1), AfterValidator(_w
 
 
 class Classes(Frozen):
-    """What objects are taken for, by their true class; a class that is left out is always told.
+    """Classes that objects are listed as, by their true class; a class that is left out is always listed as it is.
 
     `confidence`: the probability that is stated of the class that is listed; the rest is spread evenly over the others.
     """

@@ -1,4 +1,4 @@
-"""Detection models: is an object listed? They return a probability and never draw."""
+"""Detection models: the probability that an object is listed. They never draw."""
 
 from __future__ import annotations
 

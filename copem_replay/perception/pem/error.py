@@ -1,4 +1,4 @@
-"""Error models: how far off is a listed object? They scale the standard normals they are handed and never draw."""
+"""Error models: the errors of listed objects. They scale the standard normals they are handed and never draw."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ErrorModel(Component, ABC):
 
     @abstractmethod
     def perturb(self, view: ViewGeometry, noise: Noise) -> Errors:
-        """Errors of every candidate row in every run, and how uncertain the unit says its entries are.
+        """Errors of every observation in every run, and the covariance that the unit states.
 
         `view` has P rows, one per object and list. `noise(name)` gives (S, P) standard normals, a row of them per run:
         one name for each independent quantity, the same numbers whenever it is asked for. No other source of chance.

@@ -1,4 +1,4 @@
-"""Ghosts: entries about nobody. How many there are, how long they last, where they are, and what they look like. Keys.
+"""Ghosts: entries about no object. Keys: how many there are, how long they last, where they are, and their classes.
 
 What comes of them in a run: `perception/ghosts.py`. docs/guide/unit-errors.md.
 """

@@ -1,4 +1,4 @@
-"""Memory of a PEM: which of its draws last, for how long, and who has them in common. Keys of the experiment file.
+"""Memory of a PEM: which of its draws last, for how long, and which rows share them. Keys of the experiment file.
 
 Models do not know of it: what changes is which numbers they are handed. docs/guide/perception-models.md.
 """
@@ -24,14 +24,14 @@ def quantity_of(noise: str) -> str:
     return "size" if first in _OF_SIZE else first
 
 
-def check_names(memory: Mapping[str, Parts], asked: frozenset[str] | None, who: str) -> None:
+def check_names(memory: Mapping[str, Parts], asked: frozenset[str] | None, owner: str) -> None:
     """Raise pydantic's ValidationError, at the name, for quantities that nothing draws; `asked` None: not known."""
     if asked is None:
         return
     there = ", ".join(sorted(asked)) or "none"
     problems = []
     for name in memory.keys() - asked - set(QUANTITIES):
-        message = f'no model of this {who} asks for noise "{name}" (they ask for {there})'
+        message = f'no model of this {owner} asks for noise "{name}" (they ask for {there})'
         kind = PydanticCustomError("memory", "{m}", {"m": message})
         problems.append(InitErrorDetails(type=kind, loc=("memory", name), input=name))
     if problems:

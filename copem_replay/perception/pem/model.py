@@ -73,7 +73,7 @@ class Pem(Frozen):
 
     @property
     def draws_claims(self) -> bool:
-        """Whether what entries say beside their states, or which entries there are about nobody, is drawn."""
+        """Whether claims of entries beside their states, or ghosts, are drawn."""
         return self._scores or bool(self.ghosts) or self.classes is not None or self.tracks is not None
 
     @property

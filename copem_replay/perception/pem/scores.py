@@ -1,4 +1,4 @@
-"""Existence scores: how sure a unit says it is of an entry, drawn anew of each, of real objects and of ghosts apart."""
+"""Existence scores: the existence that a unit claims, drawn for each entry, of real objects and of ghosts apart."""
 
 from __future__ import annotations
 
