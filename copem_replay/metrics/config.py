@@ -184,7 +184,7 @@ class Measure(Frozen):
 class Braking(Frozen):
     """What the ego's declared driver does when an object is known (`brakes_for: object`) or seen to be in its way.
 
-    `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (whoever was recorded may
+    `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (the recorded driver may
     have braked already).
     """
 

@@ -1,4 +1,4 @@
-"""Measure: one row per configuration × run × measured object. Never detected is kept, not dropped.
+"""The detections: one row per configuration × run × measured object. Never detected is kept, not dropped.
 
 time_to_detection_s: from the onset to the instant the list that confirmed the object was available; null when never.
 distance_at_detection_m: true horizontal distance between the centres of object and ego at that instant.
@@ -35,7 +35,7 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(frozen=True)
 class Events:
-    """What one configuration came to know and when, run by run: (S, M), or (1, M) where all runs agree.
+    """Detections of one configuration, run by run: (S, M), or (1, M) where all runs agree.
 
     `units`: names of those whose indices `detections` has. `in_sight_s`: when any of its units had the object in sight,
     NaN: never, or not known. `conflict_known_s`: when a collision was implied, NaN: never. `way`: None where lists have

@@ -1,4 +1,4 @@
-"""From when, and until when, do we look at an object?
+"""Episodes: from when, and until when, an object is observed.
 
 Onset: the first frame at which its condition holds while the ego is in the log. The episode ends at the object's own
 last frame (`object_left`: not seen by then, it is never detected), the ego's (`ego_left`) or the log's (`log_end`);

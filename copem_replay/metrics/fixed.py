@@ -1,7 +1,7 @@
-"""What is the same in every run, because no random number is behind it: an interval over runs would tell nothing.
+"""Results that are the same in every run, as no random number is behind them: an interval over runs tells nothing.
 
-By kind of unit: the lists of the truth and of recorded units are not drawn, those of a unit with a PEM are (and so is
-who carries it), even where its probabilities are 0 or 1. A driver's delay is drawn, but for the `constant` reaction.
+By kind of unit: the lists of the truth and of recorded units are not drawn, those of a unit with a PEM are (and so are
+its carriers), even where its probabilities are 0 or 1. A driver's delay is drawn, but for the `constant` reaction.
 """
 
 from __future__ import annotations

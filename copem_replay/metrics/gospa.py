@@ -1,4 +1,4 @@
-"""How far is a list from the truth? GOSPA (α = 2) with its parts, and OSPA, of positions without identities.
+"""Distances of a list from the truth: GOSPA (α = 2) with its parts, and OSPA, of positions without identities.
 
 Both are metrics between finite sets of points, with a cut-off c and a power p ≥ 1. A true and an estimated object may
 be paired where they are nearer than c, and the pairs are those of least total cost:

@@ -1,4 +1,4 @@
-"""When did somebody have the object in sight? What perception can make of it is another matter.
+"""The first instants at which units have an object in sight, whether or not they detect it.
 
 In sight is what shows: a visible share above 0, in a list of a modelled unit, whatever its range and field of view.
 """

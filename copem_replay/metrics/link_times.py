@@ -1,4 +1,4 @@
-"""What links make of lists: of configurations that name one, and of no others."""
+"""Lists under way: columns of configurations that name a link, and of no others."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def first_of(arrives_s: Float, listed: Float, unit_ix: Int, share: Float, lasts:
     if lasts is not None:
         missed, half = lasts.log_missed(listed, missed), lasts.log_missed(moved_odds(listed, _HALF), half)
     step, slope, log_half = np.zeros(len(time_s)), 0.0, 0.0
-    # Who is certain to be there is one group.
+    # Units that are certain to be there are one group.
     group = np.where(share[unit_ix] == 1, -1, unit_ix)
     order = np.argsort(group, kind="stable")
     numbers, begins = np.unique(group[order], return_index=True)

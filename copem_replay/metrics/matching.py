@@ -1,10 +1,10 @@
-"""Which true object is each entry of a fused list about? List by list, for every fusion that goes without truth ids.
+"""Matches of fused entries with true objects: list by list, for every fusion without truth ids.
 
 An entry *tells of* one instant: of its newest capture, or, where the fusion brings its entries to the present, of the
 instant the list is available (`ListFusion.tells_of`). An object is *within the gate* of an entry when it is there at
-that instant, the horizontal distance of their centres is at most the gate, and their classes agree
-(`core/agree.py`; of the entry the most probable one). In a gap of the truth nobody is there. All true objects of the
-instant count, measured or not, moving or not, the ego too: an entry at one of them is no ghost.
+that instant, the horizontal distance of their centres is at most the gate, and their classes agree (`core/agree.py`; of
+the entry the most probable one). In a gap of the truth the object is absent. All true objects of the instant count,
+measured or not, moving or not, the ego too: an entry at one of them is no ghost.
 
 1. Every entry belongs to the nearest object within its gate. Of several at one object the *preferred* one is its
    match: the highest existence, then the first unit's (last where it is not said), then the smaller x, the smaller y;
@@ -238,7 +238,7 @@ def _nearest(
     # agrees with `of`; −1: none.
     least, best, west_m = gate_m * gate_m, -1, x - gate_m
     left = high - first
-    while left > 0:  # the first row that is not too far west; without branches, which nobody can foretell
+    while left > 0:  # the first row that is not too far west; without branches, which cannot be predicted
         half = left >> 1
         too_far = x_m[first + half] < west_m
         first = first + half + 1 if too_far else first

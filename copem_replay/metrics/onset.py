@@ -178,8 +178,8 @@ class _InSight(Onset):
         return "in sight"
 
     def described(self, near: str) -> str:
-        who = "any unit" if self.seen_by == "any" else "a unit of the ego"
-        return f"when {who} sees {100 * self.visible_share:g} % of it"
+        observer = "any unit" if self.seen_by == "any" else "a unit of the ego"
+        return f"when {observer} sees {100 * self.visible_share:g} % of it"
 
 
 class LineOfSightAny(_InSight):

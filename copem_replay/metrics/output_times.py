@@ -1,4 +1,4 @@
-"""How old a stack's own output is: of configurations that are `recorded`, and of no others."""
+"""Age of a stack's own output: of configurations that are `recorded`, and of no others."""
 
 from __future__ import annotations
 

@@ -89,11 +89,11 @@ def summary_of(
     fixed = fixed or Fixed()
     known, implied = (tallied[tallied["event"] == event] for event in (DETECTED, CONFLICT))
     judged = known[known["in_conflict"]] if "in_conflict" in known else known.iloc[:0]
-    for what, rows_of, whom in (("detected", known, "measured objects"), ("pass", judged, "objects in conflict")):
+    for what, rows_of, those in (("detected", known, "measured objects"), ("pass", judged, "objects in conflict")):
         if len(rows_of) and clusters(rows_of)[0] is None:
             notes.append(
                 f"no interval of the {what} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-                f"{whom}, and more runs do not tell about other traffic"
+                f"{those}, and more runs do not tell about other traffic"
             )
     parts, conflicts = _by_configuration(known), _by_configuration(implied)
     exactly = _by_configuration(exact) if exact is not None else {}
@@ -136,7 +136,7 @@ def _beyond_the_gate(accuracy: Mapping[str, Total]) -> list[str]:
 
 
 def _not_annotated(accuracy: Mapping[str, Total]) -> list[str]:
-    """How many entries are no ghosts because nobody says what is there."""
+    """How many entries are no ghosts because the truth is not annotated there."""
     counts = {name: int(of.runs["unannotated"]) for name, of in accuracy.items()}
     if not any(counts.values()):
         return []

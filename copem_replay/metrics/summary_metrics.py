@@ -172,7 +172,7 @@ class Exact:
 def exact(given: Given) -> Exact | None:
     """Statistics of `exact.parquet`.
 
-    Among n rows less than one is nobody: with censoring, an episode that is still open with probability 10⁻⁹ would
+    Among n rows less than one is none: with censoring, an episode that is still open with probability 10⁻⁹ would
     otherwise stand for all that were censored before.
     """
     part = given.exact

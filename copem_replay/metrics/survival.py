@@ -2,7 +2,7 @@
 
 *Time to detection* T: seconds from the onset to the detection, negative where the object was known before.
 Looking ends in one of three ways: the object is detected (`DETECTED`); it departs undetected (`LEFT`) and so
-is never detected, T = ∞; or we stop looking while it is still there (`CENSORED`), and of T is known only that
+is never detected, T = ∞; or observation stops while it is still there (`CENSORED`), and of T is known only that
 it is later.
 *Cumulative incidence* F(t): the probability that T ≤ t. Departure competes with detection, it does not
 censor: F may stay below 1 for ever, and a quantile above its last value does not exist (None).
@@ -72,12 +72,12 @@ def cumulative_incidence(
     detected, censored = ending == DETECTED, ending == CENSORED
     if not (detected | censored | (ending == LEFT)).all():
         raise ValueError("cumulative_incidence: expected endings DETECTED, LEFT or CENSORED")
-    # The estimator adds S(t−)·d/r at each time of detection: d of the r still looked at are detected, S is
-    # the probability that nothing has happened yet. Between censorings r shrinks by exactly those to whom
-    # something happens, so the product S(t−) telescopes to r/n, times (r' + c)/r' for each earlier time at
-    # which c are censored and r' > 0 remain. A detection thus weighs these factors over n: whoever is
-    # censored hands his weight on, in equal parts, to all who remain. Without censoring the weights are 1
-    # and the incidence is a ratio of whole numbers, which a product over millions of times is not.
+    # The estimator adds S(t−)·d/r at each time of detection: d of the r still looked at are detected, S is the
+    # probability that nothing has happened yet. Between censorings r shrinks by exactly those to which something
+    # happens, so the product S(t−) telescopes to r/n, times (r' + c)/r' for each earlier time at which c are censored
+    # and r' > 0 remain. A detection thus weighs these factors over n: a censored row hands its weight on, in equal
+    # parts, to all that remain. Without censoring the weights are 1 and the incidence is a ratio of whole numbers,
+    # which a product over millions of times is not.
     times_s, detections = _totals(time_s[detected], weight[detected])
     lost_s, lost = _totals(time_s[censored], weight[censored])
     order = np.argsort(time_s, kind="stable")
@@ -86,7 +86,7 @@ def cumulative_incidence(
     if total <= 0:
         raise ValueError("cumulative_incidence: expected a weight above 0")
     remaining = total - until[np.searchsorted(time_s[order], lost_s, side="right")]
-    # Where nobody remains, nobody takes the weight over.
+    # Where no row remains, the weight is not handed on.
     there = remaining >= least * total * (1 - 1e-9)
     factors = 1.0 + lost[there] / remaining[there]
     weights = np.append(1.0, np.cumprod(factors))
@@ -115,9 +115,9 @@ def quantile_time(times_s: Float, incidence: Float, q: float) -> float | None:
 def restricted_mean(times_s: Float, incidence: Float, horizon_s: float) -> float:
     """Average min(T, horizon), seconds; never detected counts as the horizon. The mean may be negative.
 
-    `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`; M may be 0, the mean is then the horizon.
-    With a = min(0, earliest time) it is a + ∫ₐʰ (1 − F(t)) dt. Beyond the last time at which anyone was
-    looked at, F is not known, only held: a horizon there counts the last censored as never detected.
+    `times_s (M,)`, `incidence (M,)` as from `cumulative_incidence`; M may be 0, the mean is then the horizon. With a =
+    min(0, earliest time) it is a + ∫ₐʰ (1 − F(t)) dt. Beyond the last time at which any row was observed, F is not
+    known, only held: a horizon there counts the last censored as never detected.
     """
     # F is 0 before its first step, so a drops out: what is left is h − ∫ F.
     before = times_s < horizon_s

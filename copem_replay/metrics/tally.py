@@ -46,14 +46,14 @@ def _of_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
     time_s = rows[columns["time_to_detection_s"]].to_numpy(dtype=float)
     known = rows["detected" if event == DETECTED else "conflict_detected"].to_numpy(dtype=bool)
     time_s = np.where(known, time_s + 0.0, np.inf)  # −0 is 0, and never comes last
-    whose = np.zeros(len(rows), dtype=np.int64)
+    episode = np.zeros(len(rows), dtype=np.int64)
     for name in ("log", "configuration", "object_id"):
         number, names = pd.factorize(rows[name])
-        whose = whose * max(len(names), 1) + number
-    whose = pd.factorize(whose)[0]
-    order = np.lexsort((time_s, whose))
+        episode = episode * max(len(names), 1) + number
+    episode = pd.factorize(episode)[0]
+    order = np.lexsort((time_s, episode))
     new = np.ones(len(rows), dtype=bool)
-    new[1:] = (np.diff(whose[order]) != 0) | (time_s[order][1:] != time_s[order][:-1])
+    new[1:] = (np.diff(episode[order]) != 0) | (time_s[order][1:] != time_s[order][:-1])
     first_of, group = order[new], np.cumsum(new) - 1
     found = {
         "log": rows["log"].to_numpy()[first_of],

@@ -1,4 +1,4 @@
-"""The way of what is known: when it was first listed, and when the list that made it known was sent and arrived."""
+"""The way of a detection: its first listing, and when the list that made the object known was sent and arrived."""
 
 from __future__ import annotations
 

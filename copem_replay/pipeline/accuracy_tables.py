@@ -1,4 +1,4 @@
-"""What the results folder says of how good the lists were: columns of rows, figures of configurations, and tables.
+"""Accuracy in the results folder: columns of rows, figures of configurations, and tables.
 
 | table | rows |
 |---|---|

@@ -107,7 +107,7 @@ def _matches(experiment: Experiment) -> bool:
 
 
 def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFrame:
-    """Only what was known and when: the rows of `detections.parquet` of one block of runs (S,), without accuracy."""
+    """Detections alone: the rows of `detections.parquet` of one block of runs (S,), without accuracy."""
     when = experiment.model_copy(update={"measure": experiment.measure.model_copy(update={"accuracy": False})})
     return frame(beneath([part.columns for part in outcomes(replay, when, runs)]))
 
@@ -249,7 +249,7 @@ def _in_sight(replay: Replay, experiment: Experiment, presence: Presence) -> dic
 
 @dataclass(frozen=True)
 class _Lists:
-    """Who is listed in the runs (S,), by truth id and without states, and when these lists arrive; made when needed."""
+    """Listed rows of the runs (S,), by truth id and without states, and when these lists arrive; made when needed."""
 
     replay: Replay
     units: ExpandedExperiment
@@ -302,7 +302,7 @@ class _Lists:
 
 
 def _by_truth_id(lists: _Lists, experiment: Experiment, sight_s: dict[str, Float]) -> dict[str, Events]:
-    """Detections of the configurations that have truth ids: they need no states, only who was listed."""
+    """Detections of the configurations that have truth ids: they need no states, only which rows are listed."""
     events: dict[str, Events] = {}
     for name, configuration in lists.units.configurations.items():
         if not by_truth(configuration):
@@ -328,7 +328,7 @@ def _sightings(
     on_air: OnAir | None,
     perceived: Perceived | None,
 ) -> Tracks:
-    """Who was listed in the runs (S,), at least of what is looked at. Of a long log without states."""
+    """The rows listed in the runs (S,), at least of measured objects. Of a long log without states."""
     pieces = []
     for chunk in replay.chunks:
         found = replay.measured if chunk == WHOLE else replay.found(chunk).of_objects(replay.episodes.object_ix)

@@ -153,16 +153,16 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
             "confirmation by several hits then has no closed form; confirm with one hit, or leave `exact` out"
         )
     instants = capture_instants(heard)
-    everyone = np.unique(instants[came])
+    of_all = np.unique(instants[came])
     for unit in np.unique(heard.frame_unit_ix[came]):
         mine = came & (heard.frame_unit_ix == unit)
-        if not np.array_equal(np.unique(instants[mine]), everyone):
+        if not np.array_equal(np.unique(instants[mine]), of_all):
             raise ExperimentError(
                 f"{replay.scene.log}: exact: configuration {name}: unit {heard.units[unit]} does not list at "
                 "every instant at which another does, and confirmation over such lists has no closed form; give all "
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
-    for instant in everyone:
+    for instant in of_all:
         arrivals = heard.common_arrives_s[came & (instants == instant)]
         if np.ptp(arrivals) > _TOLERANCE_S:
             raise ExperimentError(

@@ -24,7 +24,7 @@ def as_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
     entries = np.empty(int(fused.valid.sum()), dtype=ENTRY)
     states = np.stack(np.broadcast_arrays(*(getattr(fused, name) for name in VALUES), *floored(fused)))
     words = entries.view(np.float64).reshape(len(entries), ENTRY.itemsize // 8)
-    whose = entries.view(np.int64).reshape(words.shape)
+    ids = entries.view(np.int64).reshape(words.shape)
     _fill(
         fused.valid,
         order,
@@ -34,7 +34,7 @@ def as_lists(fused_tracks: FusedTracks, scene: Scene) -> ObjectLists:
         fused_tracks.sources,
         start,
         words,
-        whose,
+        ids,
     )
     return ObjectLists(start, entries)
 
@@ -49,7 +49,7 @@ _CLASS = _EXISTENCE + 1
 @borrowing
 def _fill(
     valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: Sources,
-    start: Int, words: Float, whose: Int,
+    start: Int, words: Float, ids: Int,
 ) -> None:  # fmt: skip
     # Entries run by run and list by list, as numbers and as integers of the same memory. States are (12, S | 1, P).
     n = 0
@@ -64,8 +64,8 @@ def _fill(
                 words[n, _EXISTENCE] = 1.0
                 words[n, _CLASS:_CAPTURED] = 0.0
                 words[n, _CLASS + classes[p]] = 1.0
-                words[n, _CAPTURED], whose[n, _UNIT] = newest_and_first(source, s, p)
-                whose[n, _TRACK] = -1
+                words[n, _CAPTURED], ids[n, _UNIT] = newest_and_first(source, s, p)
+                ids[n, _TRACK] = -1
                 n += 1
             start[s, f + 1] = n
 
@@ -81,7 +81,7 @@ def as_fused_tracks(
     said = lists.entries[first:last]
     frame = np.repeat(np.arange(len(issue_s)), np.diff(lists.start[run]))
     object_ix = np.where(matches.role[first:last] == MATCH, matches.object_ix[first:last], -1)
-    # Whoever is matched goes by its object, else by the fusion's own identity, else by itself.
+    # Tracks: the matched object, else the fusion's own identity, else the entry itself.
     alone = (object_ix < 0) & (said["track_id"] < 0)
     ident = np.where(object_ix >= 0, 0, np.where(alone, np.arange(len(said)), said["track_id"]))
     order = np.lexsort((frame, ident, alone, object_ix))

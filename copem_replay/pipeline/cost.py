@@ -1,4 +1,4 @@
-"""What a run spends its time on: said on the terminal and written nowhere, for results are the same on any machine."""
+"""The time a run takes: printed on the terminal and written nowhere, for results are the same on any machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LONG_S = 10.0
 class Cost:
     """Seconds of a run: all of it, and what its workers did, of which some was measuring accuracy.
 
-    `compiled`: kernels had to be compiled, so the next run takes less, and who knows how much of what.
+    `compiled`: kernels had to be compiled, so the next run takes less.
     """
 
     total_s: float = 0.0

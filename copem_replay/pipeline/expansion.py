@@ -3,7 +3,7 @@
 Fleets: units that some objects carry and others don't, each by an addressed draw of its own in every run.
 
 `on: {classes, penetration_rate}` stands for one unit per object of those classes (but the ego). In a run an object
-carries its unit when its number is below the share, so that who carries one at 30 % does at 50 %, too.
+carries its unit when its number is below the share, so that a carrier at 30 % is one at 50 %, too.
 
 A stack's recorded output is a recorded unit that its configuration alone hears, handed on as it is.
 """

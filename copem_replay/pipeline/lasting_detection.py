@@ -47,7 +47,7 @@ def lasting(replay: Replay, experiment: ExpandedExperiment, name: str, heard: Tr
 
 
 def _processes(experiment: ExpandedExperiment, name: str, hits: int) -> dict[str, tuple[str, float]]:
-    """By unit of a configuration whose detection lasts: whose held number it goes by, and its correlation time."""
+    """By unit of a configuration number_key detection lasts: the held number it uses, and its correlation time."""
     configuration = experiment.configurations[name]
     found: dict[str, tuple[str, float]] = {}
     for unit in () if configuration.units == TRUTH else experiment.units_of(configuration):
@@ -62,8 +62,8 @@ def _processes(experiment: ExpandedExperiment, name: str, hits: int) -> dict[str
                            "form; confirm with one hit")  # fmt: skip
         tau_s = np.inf if isinstance(part.correlation_s, str) else part.correlation_s
         key = f"{part.of} {unit}" if part.of in ("pair", "unit") else part.of
-        for other, (whose, other_s) in found.items():
-            if whose == key and other_s != tau_s:
+        for other, (number_key, other_s) in found.items():
+            if number_key == key and other_s != tau_s:
                 raise _refused(name, f"units {other} and {unit} have the numbers of `of: {part.of}` in common with two "
                                "correlation times, which has no closed form; give them one")  # fmt: skip
         found[unit] = key, tau_s
@@ -106,9 +106,9 @@ def _check_order(replay: Replay, experiment: ExpandedExperiment, name: str, hear
     arrives_s: Float = heard.common_arrives_s[frames[np.argsort(heard.captured_s[frames], kind="stable")]]
     late: Int = np.flatnonzero(arrives_s < np.maximum.accumulate(arrives_s) - _TOLERANCE_S)
     if len(late):
-        who = f"unit {units[0]}" if len(units) == 1 else f"the {counted(len(units), 'unit')} {', '.join(units)}"
+        them = f"unit {units[0]}" if len(units) == 1 else f"the {counted(len(units), 'unit')} {', '.join(units)}"
         raise _refused(
-            f"{name}", f"lists of {who} arrive in another order than they were captured in, and detection that lasts "
+            f"{name}", f"lists of {them} arrive in another order than they were captured in, and detection that lasts "
             "then has no closed form; give them one constant latency", replay.scene.log,
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What is odd about a log and an experiment together: seen before any run, said by `check` and `run` alike."""
+"""Notes on what is odd about a log and an experiment together: before any run, from `check` and `run` alike."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SAMPLE = 16  # one in so many is looked at first (chosen)
 def notes_of(
     recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
 ) -> list[str]:
-    """What has to be said of the recordings, and of them and the experiment together: after a replay, or before."""
+    """Notes on the recordings, and on them and the experiment together: after a replay, or before."""
     odd = {
         replay.scene.log: oddities(replay, of_log(experiment, replay.scene.log), replay.ever_met if replayed else None)
         for replay in ready

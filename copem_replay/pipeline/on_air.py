@@ -1,4 +1,4 @@
-"""On air: what drawn links go by, beside the lists themselves: one run's numbers, the way to the ego, and sizes."""
+"""On air: the input of drawn links beside the lists themselves: one run's numbers, the way to the ego, and sizes."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
             units = experiment.units_of(configuration) if one.units is None else one.units
             far = [TRUTH] if configuration.units == TRUTH else sorted(experiment.recorded.keys() & set(units))
             if far:
-                whose = "of the truth" if far == [TRUTH] else f"of unit {far[0]}, whose lists are recorded,"
-                raise ExperimentError(f"{where}: the distance {whose} to a receiver is not known; use constant")
+                source = "of the truth" if far == [TRUTH] else f"of unit {far[0]}, source lists are recorded,"
+                raise ExperimentError(f"{where}: the distance {source} to a receiver is not known; use constant")
     return asked
 
 

@@ -46,7 +46,7 @@ class WorldChunk:
 
     `truth` at its own frames; `found`: rows of the modelled units, `recorded` those of the others. `experiment` has a
     unit per carrier. What was captured before the time chunk and is needed in it is there, too, since `earliest_s`.
-    `placed`: where the units are, for what they list of nobody. `on_air`: what drawn links go by. `perceived`: of all
+    `placed`: where the units are, for their ghosts. `on_air`: the input of drawn links. `perceived`: of all
     runs of a block that go one by one, None: each run is perceived by itself.
     """
 
@@ -265,7 +265,7 @@ class Receivers:
 
 
 def ghosts_of(world: WorldChunk, runs: Int) -> GhostRows | None:
-    """What units list of nobody, where a block has one run and there is a fusion that would not know better."""
+    """Ghosts of the units, where a block has one run and there is a fusion without truth ids."""
     if not world.experiment.runs_apart or world.placed is None:
         return None
     between_s = world.earliest_s, world.chunk.until_s
@@ -325,7 +325,7 @@ def _without_truth(
 
 
 def _entries(world: WorldChunk, seen: Tracks) -> tuple[RowEntries, RandomKey]:
-    """Rows of lists of which nothing is drawn but which there are and their states; and whose they are."""
+    """Rows of lists of which nothing is drawn but which there are and their states; and their units."""
     rows = claimed_rows(world, np.empty(0, dtype=np.int64), None)
     claims = Claims(rows.claims.existence, rows.claims.class_probability, rows.claims.track_id)
     return RowEntries(seen, claims), RandomKey(seen.units, seen.row_unit_ix, rows.words, seen.stamp_ns[seen.frame_ix])

@@ -109,7 +109,7 @@ def _of_every_log(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
 def _closure(experiment: Experiment, configuration: Configuration) -> list[str]:
     """The units that rows of a configuration depend on, in the experiment's order."""
     measure, members = experiment.measure, experiment.units_of(configuration)
-    if measure.onset.requires is not Requires.NOTHING or is_own(type(measure.onset)):  # which may ask who sees what
+    if measure.onset.requires is not Requires.NOTHING or is_own(type(measure.onset)):  # which may ask for visibility
         return list(experiment.units)
     return [name for name in experiment.units if name in members or name == measure.distance_to]
 

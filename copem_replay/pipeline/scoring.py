@@ -1,4 +1,4 @@
-"""Appraise: how good were a configuration's fused lists?
+"""Scoring: how good a configuration's fused lists are.
 
 What is said of an object is matched with the truth at the instant it tells of, what a list is worth now with the truth
 at the instant it was available (`metrics/matching.py`).

@@ -26,7 +26,7 @@ _VRU = class_indices(("vru",))
 
 @dataclass(frozen=True)
 class ClaimedRows:
-    """What the modelled units claim of their rows (P,), ghosts last, in one run, and who each row is about.
+    """What the modelled units claim of their rows (P,), ghosts last, in one run, and the object of each row.
 
     `words`: the object or the ghost; `same`: what the unit takes for one object, a number that is no index.
     """
@@ -41,7 +41,7 @@ def claimed_rows(world: WorldChunk, runs: Int, ghosts: GhostRows | None) -> Clai
     found, experiment = world.found, world.experiment
     words = object_words(world.scene.object_ids)[found.tracks.row_object_ix]
     claims = DrawnClaims(found.existence, np.eye(len(CLASSES))[found.view.class_ix], np.full(len(words), -1))
-    if experiment.runs_apart and experiment.draws_claims:  # else nobody would hear of it
+    if experiment.runs_apart and experiment.draws_claims:  # else no receiver needs it
         claims = claims_of(found, experiment, draws_of(world.scene, found, experiment, runs))
     same = words
     if ghosts is not None:
@@ -79,7 +79,7 @@ class SentObjects:
     keys: Words
 
     def of(self, seen: Tracks, words: Words) -> Tracks:
-        """What is sent of the rows of the modelled units; `words (P,)`: who they are about."""
+        """What is sent of the rows of the modelled units; `words (P,)`: the words of their objects."""
         left_out = self.partial[seen.row_unit_ix] & ~np.isin(_keys(seen.frame_ix, words), self.keys)
         arrives_s = np.where(self.lists, seen.common_arrives_s, np.inf)
         return replace(seen, valid=seen.valid & ~left_out & self.lists[seen.frame_ix], arrives_s=arrives_s[None])

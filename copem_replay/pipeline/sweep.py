@@ -1,10 +1,10 @@
-"""Sweeps: the same experiment at many values of one quantity, everything else as it is, on the same dice.
+"""Sweeps: the same experiment at many values of one quantity, everything else as it is, with common random numbers.
 
 A sweep of `latency_s` or `units` only varies configurations, one of `rate_hz` or `penetration_rate` the units
-themselves, one of `correlation_s` what their PEMs remember, one of `ghosts_in_list` what they list of nobody, of which
-the truth and ideal fusion never know. Configurations that it leaves as they are, or makes equal
-to one before, are left out. A latency is varied only where there is one (above 0, or by unit) or where the
-configuration is named: who hears of nobody over the air has none.
+themselves, one of `correlation_s` what their PEMs remember, one of `ghosts_in_list` their ghosts, of which the truth
+and ideal fusion never know. Configurations that it leaves as they are, or makes equal to one before, are left out. A
+latency is varied only where there is one (above 0, or by unit) or where the configuration is named: one that hears no
+unit over the air has none.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _unstated(experiment: Experiment, kind: str) -> str:
 
 
 def _measured(experiment: Experiment) -> Measure:
-    """Perceived conflicts take time, and are not asked for unless somebody brakes for them; accuracy never is."""
+    """Perceived conflicts take time, and are not asked for unless the driver brakes for them; accuracy never is."""
     needed = experiment.braking is not None and experiment.braking.brakes_for == "conflict"
     conflict = experiment.measure.conflict if needed else None
     return experiment.measure.model_copy(update={"conflict": conflict, "accuracy": False})

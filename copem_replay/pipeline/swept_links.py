@@ -1,4 +1,4 @@
-"""Links along a sweep: how much they lose, and for how long at a time. On common dice, more loss only removes lists."""
+"""Links along a sweep: how much they lose, and how long at a time. With common draws more loss only removes lists."""
 
 from __future__ import annotations
 

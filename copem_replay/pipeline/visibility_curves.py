@@ -12,7 +12,7 @@ from copem_replay.perception.sensor_poses import carrier
 from copem_replay.pipeline.prepare import Replay
 
 BY_EGO, BY_ANY = "ego", "any unit"
-"""Whose share a curve is: the best of the ego's units, the best of all."""
+"""Names of curves: the best share of the ego's units, and of all."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Curve:
 
 
 def share_curves(replay: Replay, found: Observations, object_ix: int) -> dict[str, Curve]:
-    """By whom an object is seen, and how much of it; nobody's curve is left out. `found`: its rows, at least."""
+    """The curves of an object, without those that no unit sees. `found`: its rows, at least."""
     scene, experiment, tracks = replay.scene, replay.expanded, found.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
@@ -34,8 +34,8 @@ def share_curves(replay: Replay, found: Observations, object_ix: int) -> dict[st
     share[tracks.frame_ix[rows]] = found.view.visible_share[rows]
     # A unit without a list of the object says nothing about it: the best of the others counts.
     return {
-        whose: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
-        for whose, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
+        name: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
+        for name, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
         if units.any()
     }
 

@@ -1,4 +1,4 @@
-"""What in a results folder is ours, and goes when new results take its place; the rest stays."""
+"""Files that belong to a results folder, and go when new results take its place; the rest stays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Belongings:
     every: tuple[str, ...]  # files, links, empty folders
 
     def others(self, written: Collection[str]) -> list[str]:
-        """What is not ours; `written`: what the new results are. A folder that does not say has the same."""
+        """The user's own files; `written`: what the new results are. A folder that does not say has the same."""
         ours = (self.ours if self.ours is not None else frozenset(written)) | _MADE_OF_RESULTS
         return [name for name in self.every if name not in ours]
 

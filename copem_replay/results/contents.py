@@ -41,7 +41,7 @@ def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Pa
 
 
 def written_name(file: File, folder: Path) -> str:
-    """What results in a folder call a recording: its path from there, or its URL without what lets us in."""
+    """What results in a folder call a recording: its path from there, or its URL without user and query."""
     return str(file) if isinstance(file, Remote) else os.path.relpath(place_of(file), folder)
 
 

@@ -25,8 +25,8 @@ def only_writer(folder: Path) -> Iterator[None]:
     fd, locked = _opened(path, folder)
     if locked:
         with suppress(OSError):
-            os.pwrite(fd, (who := f"process {os.getpid()} on {platform.node()}\n").encode(), 0)
-            os.ftruncate(fd, len(who.encode()))
+            os.pwrite(fd, (name := f"process {os.getpid()} on {platform.node()}\n").encode(), 0)
+            os.ftruncate(fd, len(name.encode()))
     try:
         yield
     finally:
@@ -48,9 +48,9 @@ def _opened(path: Path, folder: Path) -> tuple[int, bool]:
             return fd, bool(locked)
         try:
             if locked is False:
-                who = os.pread(fd, 200, 0).decode(errors="replace").strip()
+                name = os.pread(fd, 200, 0).decode(errors="replace").strip()
                 raise OutputError(
-                    f"{folder}: another run ({who or 'just started'}) is writing its results there; wait until it has "
+                    f"{folder}: another run ({name or 'just started'}) is writing its results there; wait until it has "
                     "ended, or choose another folder with --out"
                 )
         finally:

@@ -64,7 +64,7 @@ class Place:
         flush(self.folder.parent)
 
     def _replace(self, files: Sequence[str]) -> str | None:
-        """Put the new folder in the place of the old one, with what in it is not ours. Returns why not: None, it is."""
+        """Put the new folder in the place of the old one, with the user's own files. Returns why not: None, it is."""
         held = belongings(self.folder)
         if held is None:
             return _OTHERS
@@ -88,7 +88,7 @@ class Place:
         return None
 
     def _keep(self, held: Belongings, files: Sequence[str]) -> dict[str, str]:
-        """Have what is not ours in the new folder, too: its names there by those in the old one."""
+        """Have the user's own files in the new folder, too: its names there by those in the old one."""
         others = held.others(files)
         ours = set(held.every) - set(others)
         removable = [_SPARE, *(f"{_NEW}/{name}" for name in {*files, *ours}), *(f"{OLD}/{name}" for name in ours)]

@@ -2,7 +2,7 @@
 
 | entity | is |
 |---|---|
-| `world/truth/boxes`, `ego`, `paths`, `onsets` | the log; of objects we look at, ways, and places at their onsets |
+| `world/truth/boxes`, `ego`, `paths`, `onsets` | the log; of the shown objects, ways, and places at their onsets |
 | `world/truth/lanes` | boundaries of lanes, where the log has them |
 | `world/static/obstacles`, `grid` | obstacles, and lines on the ground every 10 m |
 | `world/units/<unit>`, `world/fields/<unit>` | units, and the fields of view of their PEMs |
@@ -17,7 +17,7 @@
 | `plots/position_error/<object>/<configuration>` | fused to true position: running median, and band |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/differences.py`) |
-| `legend/…` | whose colour is which |
+| `legend/…` | the colour of each configuration |
 | `events/onsets`, `events/<configuration>`, `…/lists`, `difference`, `summary`, `words` | in words |
 
 `<object>` is `6_pedestrian`. Of more than six configurations there are further files (`viewer/selection.py`).

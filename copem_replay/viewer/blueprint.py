@@ -1,4 +1,4 @@
-"""How it is laid out: the blueprint, a page per question."""
+"""The blueprint: a page per question."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where eyes are, what they look at and what they follow: the ego, or one of the objects we look at."""
+"""Eyes: where they are, what they look at, and what they follow: the ego, or one of the shown objects."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ def eye_on(replay: Replay, experiment: Experiment, table: pd.DataFrame, first: i
             at_m, towards = own[:3, shared[0]] + middle[:, 0], _ahead(yaw_rad)
             place = -_distance(places, towards, FOLLOWING_M, wide) * towards
             return Eye(np.round(place, 1), np.zeros(3), at_m, on, ahead_m, left_m, (*EYES, "ego"))
-    whose = episodes["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
-    rows = np.flatnonzero(np.isin(truth.row_object_ix, whose if len(whose) else truth.object_ix))
+    measured = episodes["object_id"].map(scene.object_number).to_numpy(dtype=np.int64)
+    rows = np.flatnonzero(np.isin(truth.row_object_ix, measured if len(measured) else truth.object_ix))
     place = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], truth.z_m[0, rows]])
     named = experiment.units.get(experiment.measure.distance_to)
     if named is not None and named.at is not None:

@@ -32,7 +32,7 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
     """The curves of one object; `name`: of it in entity paths."""
     import rerun as rr
 
-    for whose, curve in curves.items():
+    for units, curve in curves.items():
         known = ~np.isnan(curve.share)
         # An empty row breaks the line. NaN would, too, but no two recordings with NaN compare equal.
         kept = known | np.append(False, known[:-1])
@@ -42,10 +42,10 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
         bends = bends[: len(value)]
         value, instants = value[bends], instants[bends]
         values = rr.Scalars.columns(scalars=value[value >= 0]).partition((value >= 0).astype(np.int64))
-        path = ["plots", "visible_share", name, plain(whose)]
+        path = ["plots", "visible_share", name, plain(units)]
         out.columns(path, instants, values)
-        colour, width = _LOOKS[whose]
-        out.static(path, rr.SeriesLines(names=whose, colors=colour, widths=width))
+        colour, width = _LOOKS[units]
+        out.static(path, rr.SeriesLines(names=units, colors=colour, widths=width))
 
 
 def position_errors(
@@ -111,7 +111,7 @@ def gospa_of(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) 
     """
     scene, fused, measure = replay.scene, fused_tracks.fused, experiment.measure
     settings = settings_of(measure, scene.end_s)
-    numbers = np.arange(len(scene.object_ids) + 1)  # the last: nobody
+    numbers = np.arange(len(scene.object_ids) + 1)  # the last: no object
     measured = np.isin(numbers, measured_objects(scene, measure)) & ~np.isin(numbers, replay.outside_ix)
     ghosts = replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)] & (fused.row_object_ix < 0)
     if measure.annotated is not None:

@@ -1,11 +1,11 @@
-"""Differences of configurations to a baseline, in the view of each: who knows what the other does not, and since when.
+"""Differences of configurations to a baseline, in the view of each: what only one of the two knows, and since when.
 
 | entity | is |
 |---|---|
 | `world/<configuration>/difference/gained`, `lost` | objects that only it, or only the baseline, holds then |
 | `world/<configuration>/difference/first` | the way an object went between both knowing it for the first time |
 | `plots/error_difference/<object>/<configuration>` | of position errors, at instants at which both list it |
-| `events/difference/<configuration>` | in words, who knew it first |
+| `events/difference/<configuration>` | in words, which knew it first |
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _ways(
 
 
 def _words(out: Out, both: pd.DataFrame, name: str, baseline: str) -> None:
-    """Of all measured objects, who knew it first. `both`: rows of both, joined."""
+    """For each measured object, which configuration knew it first. `both`: rows of both, joined."""
     import rerun as rr
 
     told = sorted(_told(both.assign(together=_together(both)), name, baseline), key=lambda event: event[0])
@@ -155,12 +155,12 @@ def _together(both: pd.DataFrame) -> pd.Series:
 def _told(both: pd.DataFrame, name: str, baseline: str) -> Iterator[tuple[float, str, str]]:
     """When it is settled, how serious, what: a sentence for every object that at least one of the two knew."""
     for episode in table_rows(both):
-        who = f"{episode.object_id} {episode.object_class}"
+        one = f"{episode.object_id} {episode.object_class}"
         if episode.detected and episode.detected_baseline:
             after_s = episode.detection_s - episode.detection_s_baseline
             when = f"{abs(after_s):.2f} s {'after' if after_s > 0 else 'before'}"
             when = "as soon as" if episode.together else when
-            yield max(episode.detection_s, episode.detection_s_baseline), "INFO", f"{name} knew {who} {when} {baseline}"
+            yield max(episode.detection_s, episode.detection_s_baseline), "INFO", f"{name} knew {one} {when} {baseline}"
         elif episode.detected or episode.detected_baseline:
             knew, never = (name, baseline) if episode.detected else (baseline, name)
-            yield episode.ended_s, "WARN", f"{never} never knew {who}, {knew} did"
+            yield episode.ended_s, "WARN", f"{never} never knew {one}, {knew} did"

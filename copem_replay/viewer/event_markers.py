@@ -63,7 +63,7 @@ def detections(
     ]
     try:
         at = reference(part["detection_s"].to_numpy(dtype=float))
-    except ExperimentError:  # nobody's distances are measured
+    except ExperimentError:  # no distances are measured
         at = None
     _stay(out, path, replay, experiment, part, "detection_s", [""] * len(part) if at else told, colour, up=1)
     if at is not None:
@@ -151,11 +151,11 @@ def on_curves(
     marks = [(BY_EGO, episodes["onset_s"].head(1), ONSET, rr.components.MarkerShape.Diamond)]
     for configuration, colour in colours.items():
         mine = episodes[(episodes["configuration"] == configuration) & episodes["detected"]]
-        whose = BY_EGO if _only_ego(replay, experiment, configuration) else BY_ANY
-        marks.append((whose, mine["detection_s"], colour, rr.components.MarkerShape.Circle))
+        curve = BY_EGO if _only_ego(replay, experiment, configuration) else BY_ANY
+        marks.append((curve, mine["detection_s"], colour, rr.components.MarkerShape.Circle))
     rows: list[tuple[int, float, Rgb, Any]] = []
-    for whose, time_s, colour, shape in marks:
-        known_ns, heights = _on(curves.get(whose, curves[BY_ANY]), ns(time_s))
+    for curve, time_s, colour, shape in marks:
+        known_ns, heights = _on(curves.get(curve, curves[BY_ANY]), ns(time_s))
         rows += [(at, height, colour, shape) for at, height in zip(known_ns.tolist(), heights.tolist(), strict=True)]
     if not rows:
         return

@@ -1,4 +1,4 @@
-"""Lanes: what each shown object is to each configuration over time, changes that nobody could follow left out.
+"""Lanes: what each shown object is to each configuration over time, changes too short to follow left out.
 
 An entity per object and configuration, `lanes/6_pedestrian/2_PEM`; its number is its place among those of the file. A
 white mark ends at the onset. Nothing is said while the object is absent. Known begins at `detection_s`, to the
@@ -98,7 +98,7 @@ def steady(elapsed_ns: Int, status: Int) -> list[Span]:
 
 
 def _text(ids: Sequence[str], units: Sequence[str], seen: Sight, of: Status, m: int, span: Span) -> str | None:
-    """What is said of a span: by whom, or by what, for the most part of it."""
+    """The text of a span: the unit, or what hides the object, for the most part of it."""
     if span.status == ABSENT:
         return None
     rows = np.arange(span.first, span.end)

@@ -1,4 +1,4 @@
-"""Whose colour is which, and what lines and bodies are: bars with names on them, in a view of their own."""
+"""The colours of configurations, and what lines and bodies are: bars with names on them, in a view of their own."""
 
 from __future__ import annotations
 

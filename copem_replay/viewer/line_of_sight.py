@@ -44,7 +44,7 @@ class Sight:
 def sight(replay: Replay, experiment: Experiment, shown: Sequence[int], found: Observations | None = None) -> Sight:
     """Computed only at the frames at which one of the shown objects is there.
 
-    `found`: rows of the shown objects, at least, whose visible shares are known and need not be computed again.
+    `found`: rows of the shown objects, at least, bodies visible shares are known and need not be computed again.
     """
     scene, truth = replay.scene, replay.truth
     stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
@@ -135,7 +135,7 @@ def _shares(
 def _near_lines(world: Tracks, at: UnitPoses, rows: Int, wanted: Bool, model: VisibilityModel) -> tuple[Tracks, Int]:
     """The world without what cannot hide any of the `wanted` rows from the unit, and where the rows are in it.
 
-    A body within whose radius no line from the unit to a place within the target's radius runs hides none of it. A
+    A body within bodies radius no line from the unit to a place within the target's radius runs hides none of it. A
     model of the user's own is asked with the whole world.
     """
     if is_own(type(model)):
@@ -177,7 +177,7 @@ def _hidden(
     replay: Replay, experiment: Experiment, unit: Unit, at: UnitPoses, seen: Sight, u: int, part: slice,
     obstacles: np.ndarray,
 ) -> None:  # fmt: skip
-    """What hides whom from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`.
+    """What hides objects from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`.
 
     `at`: where the unit is at the frames of the `part`.
     """
@@ -197,9 +197,9 @@ def _hidden(
     rows, column = rows[kept], column[kept]
     count = len(world.frame_ix)
     body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
-    whose = np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))])
+    bodies = np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))])
     where = np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), obstacles])
-    seen.body_ix[u, frames[world.frame_ix[rows]], column] = whose[body]
+    seen.body_ix[u, frames[world.frame_ix[rows]], column] = bodies[body]
     seen.body_m[u, frames[world.frame_ix[rows]], column] = where[body]
 
 

@@ -1,7 +1,7 @@
 """The recordings of a results folder, and the instant at which each of them opens: just before the first onset.
 
 A layout in a recording cannot hold an instant (Rerun 0.41), and addresses with one (`#when=`) lead to servers only. So
-whoever opens a recording sets it: for the viewer on this machine `seek`, for a browser the page of `viewer/web.py`.
+the opening program sets it: for the viewer on this machine `seek`, for a browser the page of `viewer/web.py`.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ MANY = 4
 
 @dataclass(frozen=True)
 class Content:
-    """What one file shows: a run, its configurations in order, and the objects we look at, the most telling first.
+    """What one file shows: a run, its configurations in order, and the shown objects, the most telling first.
 
     `episodes`: the rows of the table by object; `axes_s`: from when to when each is looked at.
     `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have names.
@@ -82,7 +82,7 @@ def time_axis(first_s: float, last_s: float) -> rrb.TimeAxis:
 
 
 def overview(of: Content) -> rrb.Container:
-    """What each believes, over when it knew and what difference that made."""
+    """The fused tracks of each, over when it knew and what difference that made."""
     import rerun.blueprint as rrb
 
     views, below, shares = list[rrb.View](believes(of)), list[rrb.Container | rrb.View]([difference()]), [4.0]
@@ -148,9 +148,9 @@ def _last_to_first(of: Content, object_ix: int) -> list[tuple[str, str]]:
     ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
     between = [ranked[len(ranked) // 2]] if len(of.objects) == 1 else []
     chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
-    who = of.id_of(object_ix)
+    one = of.id_of(object_ix)
     said = {
-        name: f"{name}: {who} known {s:.2f} s after its onset" if np.isfinite(s) else f"{name}: {who} never known"
+        name: f"{name}: {one} known {s:.2f} s after its onset" if np.isfinite(s) else f"{name}: {one} never known"
         for name, s in when_s.items()
     }
     return [(name, said[name]) for name in chosen]
@@ -168,7 +168,7 @@ def what_each_believes(of: Content) -> rrb.Container:
 
 
 def how_far_off(of: Content) -> rrb.Container:
-    """Position errors of every object we look at, and what holds for all measured ones."""
+    """Position errors of every shown object, and what holds for all measured ones."""
     import rerun.blueprint as rrb
 
     names = entity_names(of.replay.scene)
@@ -222,7 +222,7 @@ def in_words() -> rrb.Container:
 
 
 def believes(of: Content, said: str = "") -> list[rrb.Spatial3DView]:
-    """What each configuration believes, from the ego's side."""
+    """The fused tracks of each configuration, from the ego's side."""
     alone = len(of.objects) == 1
     return [world_view(of, name, name + said, of.eye, units=of.heard(name), marks=alone) for name in of.configurations]
 
@@ -283,7 +283,7 @@ def difference() -> rrb.TextDocumentView:
 
 
 def legend() -> rrb.Spatial2DView:
-    """Whose colour is which."""
+    """The colours of configurations."""
     import rerun.blueprint as rrb
 
     bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)

@@ -65,8 +65,8 @@ def reasons(
     ids, units = short_ids(scene), [*experiment.units, TRUTH]  # −1: the truth, or no unit
     asked = [(ids[seen.object_ix[key[0]]], units[key[2]], body_name(ids, key[5]), key) for key in keys.tolist()]
     taken = pa.array(which)
-    labels = [_label(who, unit, what, key) for who, unit, what, key in asked]
-    sentences = [_sentence(who, unit, what, key) for who, unit, what, key in asked]
+    labels = [_label(name, unit, what, key) for name, unit, what, key in asked]
+    sentences = [_sentence(name, unit, what, key) for name, unit, what, key in asked]
     return Reasons(pa.array(labels, pa.string()).take(taken), pa.array(sentences, pa.string()).take(taken), which)
 
 
@@ -84,7 +84,7 @@ def _distinct(columns: Int) -> tuple[Int, Int]:
     return columns[first], which.reshape(-1)
 
 
-def _label(who: str, unit: str, what: str, key: list[int]) -> str:
+def _label(name: str, unit: str, what: str, key: list[int]) -> str:
     """“58 behind 41”; what is known is only named."""
     _, status, _, _, _, _, near, started = key
     said = {
@@ -99,30 +99,30 @@ def _label(who: str, unit: str, what: str, key: list[int]) -> str:
         VISIBLE: " not listed yet" if unit == TRUTH else " not listed",
         HIDDEN: f" behind {what}",
     }
-    return who + said.get(status, " out of view" if near else " out of range")
+    return name + said.get(status, " out of view" if near else " out of range")
 
 
-def _sentence(who: str, unit: str, what: str, key: list[int]) -> str:
+def _sentence(name: str, unit: str, what: str, key: list[int]) -> str:
     """“58 hidden from ego by 41 (share 0.21)”."""
     _, status, _, tenths, hundredths, _, near, started = key
     if status >= EARLY:
         old = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
         early = ", onset not known yet" if started else ""
         after = {EARLY: f"{old}{early}", UNCONFIRMED: f"{old}, not confirmed yet", TOO_LATE: f" too late{old}"}
-        return f"{who} known{old}" if status == KNOWN else f"{who} listed{after[status]}"
+        return f"{name} known{old}" if status == KNOWN else f"{name} listed{after[status]}"
     if status == CAPTURED:
-        return f"{who} listed by {unit}, arrives in {tenths / 10:.1f} s"
+        return f"{name} listed by {unit}, arrives in {tenths / 10:.1f} s"
     if status == UNMATCHED:
-        return f"{who} listed by {unit}, no entry matched"
+        return f"{name} listed by {unit}, no entry matched"
     if status == LOST:
-        return f"{who} listed by {unit}, list lost"
+        return f"{name} listed by {unit}, list lost"
     if status == VISIBLE:
-        return f"{who} not listed yet" if unit == TRUTH else f"{who} seen by {unit}, not listed"
+        return f"{name} not listed yet" if unit == TRUTH else f"{name} seen by {unit}, not listed"
     if status == UNLISTED:
-        return f"{who} not listed"
+        return f"{name} not listed"
     if status == HIDDEN:
-        return f"{who} hidden from {unit} by {what} (share {hundredths / 100:.2f})"
-    return f"{who} outside fields of view" if near else f"{who} out of range"
+        return f"{name} hidden from {unit} by {what} (share {hundredths / 100:.2f})"
+    return f"{name} outside fields of view" if near else f"{name} out of range"
 
 
 def lane_text(status: int, unit: str, what: str) -> str:

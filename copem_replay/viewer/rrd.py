@@ -1,4 +1,4 @@
-"""The file: everything put together, complete under its name or not there."""
+"""The `.rrd` file: complete under its name, or not there."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def _fused(file: _File, run_tracks: Mapping[str, FusedTracks]) -> None:
 
 
 def _knowledge(file: _File, run_tracks: Mapping[str, FusedTracks], seen: Sight) -> None:
-    """Why, since when, and how far off. `run_tracks`: of the objects we look at, over all of the log."""
+    """Why, since when, and how far off. `run_tracks`: of the shown objects, over all of the log."""
     out, of = file.out, file.content
     replay, experiment, scene = of.replay, of.experiment, of.replay.scene
     made, clocks = {}, {}
@@ -230,14 +230,14 @@ def _knowledge(file: _File, run_tracks: Mapping[str, FusedTracks], seen: Sight) 
 
 
 def _shares(file: _File, found: Observations) -> None:
-    """How much is seen of each object that we look at."""
+    """How much is seen of each shown object."""
     out, of = file.out, file.content
     names = entity_names(of.replay.scene)
     for k in of.objects:
         shares = share_curves(of.replay, found, k)
         curves.visible_share(out, names[k], shares)
-        who = of.replay.scene.object_ids[k]
-        event_markers.on_curves(out, of.replay, of.experiment, of.table, who, shares, file.colours)
+        object_id = of.replay.scene.object_ids[k]
+        event_markers.on_curves(out, of.replay, of.experiment, of.table, object_id, shares, file.colours)
 
 
 def _notes(path: Path, parts: Sequence[Part], lives: Sequence[Live | None]) -> Iterator[str]:

@@ -58,7 +58,7 @@ def write_beside(
 ) -> list[str]:
     """Write one run (None: the one that the baseline's folder shows) as a recording, differences marked.
 
-    Configurations and baseline as in `compare`. Returns what has to be said. Raises InputError, RecordingError where a
+    Configurations and baseline as in `compare`. Returns notes. Raises InputError, RecordingError where a
     log is not the one that was replayed, OutputError.
     """
     from copem_replay.viewer import write_rrd

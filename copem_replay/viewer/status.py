@@ -56,7 +56,7 @@ NEVER_NS = np.iinfo(np.int64).max
 class Clock:
     """What the table says, by object (N + 1,), the last: no object. Never: NEVER_NS.
 
-    Looks are the same in all configurations, `known_ns` is of one.
+    Episodes are the same in all configurations, `known_ns` is of one.
     """
 
     onset_ns: Int
@@ -83,7 +83,7 @@ class Status:
     elapsed_ns: Int  # (K,)
     frame: Int  # (K,) of Sight, −1: before the first
     status: Int  # index into STATUSES
-    unit_ix: Int  # of the experiment: who sees most of it, or whose list is under way
+    unit_ix: Int  # of the experiment: the unit that sees most of it, or has a list under way
     until_s: Float  # until a list under way arrives
     age_of_information_s: Float  # of what is listed
     x_m: Float  # where it truly is, or its fused position while absent
@@ -123,7 +123,7 @@ def status_of(
 
 
 def _measured(seen: Sight, units: list[int], m: int, there: Bool, made: Status) -> None:
-    """Who of some units sees most of object m. Out: its column of `made`."""
+    """Which of some units sees most of object m. Out: its column of `made`."""
     share = seen.share[units][:, np.maximum(made.frame, 0), m]
     best = np.argmax(np.nan_to_num(share, nan=-1.0), axis=0)
     most = share[best, np.arange(len(best))]

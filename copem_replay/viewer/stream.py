@@ -51,7 +51,7 @@ def file_stream(path: Path, application_id: str, recording_id: str) -> Iterator[
 
 
 class _Pump(Thread):
-    """Writes what comes out of a pipe; when that fails, reads on, so that whoever fills the pipe does not wait."""
+    """Writes what comes out of a pipe; when that fails, reads on, so that the writer does not wait."""
 
     def __init__(self, out: int, path: Path) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""In words: what happened when, and the summary."""
+"""Text panels: what happened when, and the summary."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def onsets(out: Out, scene: Scene, table: pd.DataFrame) -> None:
 
     episodes = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
     text = [
-        f"onset of {_who(episode, scene)}" + (", already at its first frame" if episode.onset_at_start else "")
+        f"onset of {_named(episode, scene)}" + (", already at its first frame" if episode.onset_at_start else "")
         for episode in table_rows(episodes)
     ]
     out.columns(
@@ -39,18 +39,18 @@ def events(out: Out, scene: Scene, name: str, part: pd.DataFrame) -> None:
     out.columns(["events", part_of(name)], ns([time_s for time_s, _, _ in told]), columns)
 
 
-def _who(episode: Any, scene: Scene) -> str:
+def _named(episode: Any, scene: Scene) -> str:
     return f"{short_ids(scene)[scene.object_number[episode.object_id]]} {episode.object_class}"
 
 
 def _ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
     """When, how serious, what: of one row of the detections."""
-    who, verdict = _who(episode, scene), verdict_of(episode)
+    named, verdict = _named(episode, scene), verdict_of(episode)
     then = f"; the ego {verdict}" if verdict else ""
     if not episode.detected:
         why = EndReason(episode.ended_by)
         ending = f"undetected when {why.past}" if why.censors else "left undetected"
-        return episode.ended_s, "WARN", f"{who} {ending}{then}"
+        return episode.ended_s, "WARN", f"{named} {ending}{then}"
     late_s, far_m = episode.time_to_detection_s, episode.distance_at_detection_m
     when = f"{abs(late_s):.2f} s {'before' if late_s < 0 else 'after'} the onset"
     where = "" if np.isnan(far_m) else f", at {far_m:.1f} m"
@@ -58,7 +58,7 @@ def _ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
     return (
         episode.detection_s,
         "INFO" if passed else "WARN",
-        f"{who} detected by {episode.first_unit} {when}{where}{then}",
+        f"{named} detected by {episode.first_unit} {when}{where}{then}",
     )
 
 
@@ -98,7 +98,7 @@ def _difference(episodes: pd.DataFrame, scene: Scene) -> str:
             cells += [verdict, _metres(episode.min_distance_m)]
         unit = episode.first_unit if episode.detected else "–"
         lines.append(f"| {_cell(episode.configuration)} | {' | '.join(cells)} | {unit} |")
-    return f"**{_who(first, scene)}**, onset at {first.onset_s:.2f} s\n\n" + "\n".join(lines)
+    return f"**{_named(first, scene)}**, onset at {first.onset_s:.2f} s\n\n" + "\n".join(lines)
 
 
 def _overview(of_each: Sequence[pd.DataFrame], scene: Scene) -> str:

@@ -1,4 +1,4 @@
-"""What units list of nobody, and when they list nothing: beside them in the scene. Nothing where no unit has such."""
+"""Ghosts and outages of units, beside them in the scene. Nothing where no unit has any."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from copem_replay.viewer.sensors import unit_places
 from copem_replay.viewer.sink import Out, f32
 
 FALSE: Rgb = (255, 90, 90)
-"""Of what is false, whoever says it."""
+"""The colour of ghosts and outages, in the lists of any unit."""
 
 
 class FaultsShown:
@@ -31,7 +31,7 @@ class FaultsShown:
         told = [one for one in run_tracks.values() if one.faults is not None]
         if not told:
             return
-        # Ideal fusion is not told of ghosts: whoever is, is told of all of them.
+        # Ideal fusion is not told of ghosts; any other fusion is told of all of them.
         fullest = max(told, key=lambda one: len(one.faults.ghosts) if one.faults is not None else 0)
         heard, faults = fullest.heard, fullest.faults
         assert faults is not None

@@ -2,7 +2,7 @@
 
 The viewer's files come from rerun-sdk, which only gives them out by serving them: it is started for as long as that
 takes. Serving them here puts viewer and recordings on one port, so that one forwarded port shows them elsewhere. And it
-allows a policy that keeps the browser from asking anything of anyone else, which the viewer would by itself: fonts, its
+allows a policy that keeps the browser from asking other hosts for anything, as the viewer would by itself: fonts, its
 newest version, what it is used for.
 """
 

@@ -1,1 +1,1 @@
-"""How far off the lists are: statistics that add up, and the metrics made of them."""
+"""Accuracy of lists: statistics that add up, and the metrics made of them."""

@@ -1,4 +1,4 @@
-"""Assess: the statistics of `metrics/accuracy/statistics.py`, added up chunk after chunk of lists."""
+"""Statistics of `metrics/accuracy/statistics.py`, added up chunk after chunk of lists."""
 
 from __future__ import annotations
 

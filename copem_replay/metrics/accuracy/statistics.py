@@ -1,4 +1,4 @@
-"""How far off are the fused lists? Definitions, and statistics that add up.
+"""Accuracy of fused lists: definitions, and statistics that add up.
 
 All is counted once per fused list, at the instant it is available, in the lists at which there is a place to measure
 distances from (the ego). Nothing is held from one list to the next, nothing weighed by time. What a *match* is, a

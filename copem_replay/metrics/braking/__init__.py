@@ -1,1 +1,1 @@
-"""Braking: would the ego, braking when it knew, have stayed clear of the object? An open-loop counterfactual."""
+"""Braking: whether the ego, braking when it knew, stays clear of the object. An open-loop counterfactual."""

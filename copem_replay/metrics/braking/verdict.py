@@ -1,4 +1,4 @@
-"""Verdicts: from the instant it knew, would the declared driver have stayed clear?
+"""Verdicts: whether the declared driver, braking after the detection, stays clear.
 
 A verdict is a function of the encounter and of the instant at which braking begins, whatever led to it. From then on
 the ego is where its driver has braked to, along its own path, and never farther than it would have been without. It
@@ -82,7 +82,7 @@ def _at(values: Float, place: Float) -> Float:
 def braked(encounter: Encounter, driver: Driver, brake_s: Float) -> tuple[Float, Float]:
     """Way along the path, NaN: not in the log, and speed when braking begins at `brake_s (R,)`: (R, T) each.
 
-    Who would begin after the ego's last frame never does.
+    A beginning after the ego's last frame counts as never.
     """
     course, time_s = encounter.course, encounter.time_s
     begin_m, begin_mps, ever = _begin(encounter, brake_s)
@@ -134,7 +134,7 @@ def passing(encounter: Encounter, driver: Driver, margin_m: float) -> Float:
     """Intervals [from, to] (K, 2) of the beginnings of braking, seconds, with which the ego passes.
 
     Between beginnings `_GRID_S` apart that are judged alike it is taken to be judged the same; where they differ the
-    border is found by halves. −inf: from the onset on, before which nobody brakes.
+    border is found by halves. −inf: from the onset on, before which the ego does not brake.
     """
     grid = np.append(np.arange(encounter.time_s[0], encounter.time_s[-1], _GRID_S), encounter.time_s[-1])
     good = judge(encounter, driver, grid).min_distance_m > margin_m

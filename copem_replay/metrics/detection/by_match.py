@@ -1,4 +1,4 @@
-"""When did the receiver first know of an object? By match: for fusions that go without truth ids.
+"""First detection of an object by match: for fusions without truth ids.
 
 Known by the first list, available before looking ends, with an entry about the object (`metrics/matching.py`) that was
 captured at or after the onset: its match, or a duplicate, for the match of a union may be a unit's older entry.
@@ -84,7 +84,7 @@ class FirstMatches:
         not_before_s = np.full(count, -np.inf) if count_earlier else episodes.onset_s - _TOLERANCE_S
         self._stays = Stays(episode_of, not_before_s, episodes.ended_s + _TOLERANCE_S)
         self._confirm, self._captures = confirm, captures
-        # Captures are numbered: the instants, which are nobody's, then the lists, each its unit's.
+        # Captures are numbered: the instants, which have no unit, then the lists, each its unit's.
         self._instants = int(captures.instant.max(initial=-1)) + 1
         self._group = np.concatenate([np.full(self._instants, -1), captures.unit_ix])
         self._best = np.full((runs, count), -np.inf)

@@ -27,7 +27,7 @@ class Matched(NamedTuple):
 
 
 class Stays(NamedTuple):
-    """Looks by object, −1: none, and from which capture until which list each counts."""
+    """Episodes by object, −1: none, and from which capture until which list each counts."""
 
     episode_of: Int  # (C,)
     not_before_s: Float  # (M,)

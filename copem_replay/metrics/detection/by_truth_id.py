@@ -1,4 +1,4 @@
-"""When did the receiver first know of an object? By truth id: what a list holds is known (ideal fusion, and the truth).
+"""First detection of an object by truth id: the objects of a list are known (ideal fusion, and the truth).
 
 With ideal fusion an object is in the fused list whenever it is in a list that has arrived, so the first detection is
 read off the lists themselves; every other fusion is judged by its own lists.
@@ -99,7 +99,7 @@ def shortest_period_s(heard: Tracks) -> float:
 
 def _by_object(heard: Tracks, found: Episodes) -> tuple[Int, Int]:
     """Rows of each episode in order of arrival, then of the units: (rows,), and where each episode's begin (M + 1,)."""
-    # One place more than there are objects: index −1, no truth id, is looked at by nobody.
+    # One place more than there are objects: index −1, no truth id, has no episode.
     episode_of = np.full(int(max(found.object_ix.max(initial=-1), heard.object_ix.max(initial=-1))) + 2, -1)
     episode_of[found.object_ix] = np.arange(len(found.object_ix))
     episode = episode_of[heard.row_object_ix]
@@ -149,7 +149,7 @@ class _Rows(NamedTuple):
 
 
 class _Stays(NamedTuple):
-    # Look m: rows `order[bounds[m] : bounds[m + 1]]`, of captures and arrivals between these times.
+    # Episode m: rows `order[bounds[m] : bounds[m + 1]]`, of captures and arrivals between these times.
     order: Int
     bounds: Int
     not_before_s: Float
@@ -162,9 +162,9 @@ def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, o
     order, bounds, not_before_s, until_s = stays
     detection_s, newest_s, first_unit_ix = out
     held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
-    nobody = np.zeros(len(frame_unit_ix), dtype=np.int64)
+    no_group = np.zeros(len(frame_unit_ix), dtype=np.int64)
     # Which instants hold the object; a token per episode and run spares clearing them.
-    by_instant, by_list = nobody.copy(), nobody.copy()
+    by_instant, by_list = no_group.copy(), no_group.copy()
     token = 0
     for m in range(len(bounds) - 1):
         for s in range(valid.shape[0]):
@@ -181,7 +181,7 @@ def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, o
                 if hits > 1:
                     by_instant[cluster[p]] = by_list[frame_ix[p]] = token
                     if not (
-                        _confirmed(by_instant, token, cluster[p], hits, of, nobody)
+                        _confirmed(by_instant, token, cluster[p], hits, of, no_group)
                         or _confirmed(by_list, token, frame_ix[p], hits, of, frame_unit_ix)
                     ):
                         continue

@@ -1,8 +1,8 @@
-"""When do the receiver's fused tracks imply a collision? (The paper's detection of the potential collision.)
+"""The first fused lists that imply a collision (the paper's detection of the potential collision).
 
 A fused list implies one when the object, keeping its perceived velocity from its perceived place, will within the
 horizon be in the ego's corridor: what the ego, at its present speed, will sweep of its own path, and a margin around
-it. Ways are compared, not times: nobody is expected to be exactly in time.
+it. Paths are compared, arrival times are not.
 """
 
 from __future__ import annotations

@@ -90,10 +90,10 @@ def share_bins(bins: tuple[Bin, ...], view: ViewGeometry, worth: float) -> tuple
         return bins
     at = float(np.round(np.median(hidden), 2))
     out: list[Bin] = []
-    whose = bin_of(view, bins)
+    bin_ix = bin_of(view, bins)
     for b, one in enumerate(bins):
-        low = (view.visible_share[whose == b] <= at).sum() * worth
-        enough = min(low, (whose == b).sum() * worth - low) >= EFFECTIVE_ROWS
+        low = (view.visible_share[bin_ix == b] <= at).sum() * worth
+        enough = min(low, (bin_ix == b).sum() * worth - low) >= EFFECTIVE_ROWS
         out += [Bin(one.range_m, (0.0, at)), Bin(one.range_m, (at, 1.0))] if enough else [one]
     return tuple(out)
 

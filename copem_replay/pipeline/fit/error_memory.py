@@ -86,9 +86,9 @@ class Series:
 
     def some(self, rows: int) -> Int:
         """Rows of whole series, evenly among all, until there are so many."""
-        whose = np.cumsum(self.new) - 1
+        series_ix = np.cumsum(self.new) - 1
         step = max(len(self.new) // rows, 1)
-        return np.flatnonzero(whose % step == 0)
+        return np.flatnonzero(series_ix % step == 0)
 
 
 def whitened(values: Float, series: Series, shares: Shares) -> tuple[Float, Float]:

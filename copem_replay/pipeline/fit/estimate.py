@@ -30,8 +30,7 @@ class Estimate:
     """`value` with its 95 % interval, from `n` observations that are worth `n_effective` independent ones.
 
     `n_effective` NaN: it is not known. `why`: set where the data do not tell the number; then `value` is what is used
-    in its place, and `low` and `high` are what the data leave open (NaN: anything). `chosen`: nobody asked the data for
-    it.
+    in its place, and `low` and `high` are what the data leave open (NaN: anything). `chosen`: set, not estimated.
 
     >>> Estimate(0.9, 0.85, 0.94, n=400, n_effective=120.0).words()
     '0.9 (95 %: 0.85 … 0.94, n 400, effective 120)'

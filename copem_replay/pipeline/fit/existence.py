@@ -1,4 +1,4 @@
-"""How sure a unit says it is of an entry, of real objects and of others, and whether it is right about that."""
+"""The existence that a unit claims, of real objects and of others, and its calibration."""
 
 from __future__ import annotations
 
@@ -116,10 +116,10 @@ def _curve(real: Float, others: Float) -> Float:
 
     every = np.concatenate([real, others])
     edges = np.unique(np.quantile(every, np.linspace(0, 1, CURVE_BINS + 1)))
-    whose = np.clip(np.searchsorted(edges, every, side="right") - 1, 0, max(len(edges) - 2, 0))
+    bin_ix = np.clip(np.searchsorted(edges, every, side="right") - 1, 0, max(len(edges) - 2, 0))
     rows = []
-    for b in np.unique(whose):
-        mine = whose == b
+    for b in np.unique(bin_ix):
+        mine = bin_ix == b
         n, k = int(mine.sum()), int(mine[: len(real)].sum())
         rows.append([every[mine].mean(), k / n, *beta.ppf([0.025, 0.975], k + 0.5, n - k + 0.5), n])
     return np.array(rows).T

@@ -1,4 +1,4 @@
-"""What else a unit gets wrong: its pose, classes, existence, ghosts, ids, and when it makes no lists."""
+"""The other errors of a unit: its pose, classes, existence, ghosts, ids, and when it makes no lists."""
 
 from __future__ import annotations
 

@@ -85,8 +85,8 @@ def _times(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]
 
 def _without(reason: str, of: Sequence[str], names: Sequence[str]) -> str:
     short = short_names(names)
-    whose = "" if len(of) == len(names) else f" of {', '.join(short[name] for name in of)}"
-    return f"No interval of the mean time{whose} (hollow): {reason}"
+    of_names = "" if len(of) == len(names) else f" of {', '.join(short[name] for name in of)}"
+    return f"No interval of the mean time{of_names} (hollow): {reason}"
 
 
 def _share(rows: pd.DataFrame, names: Sequence[str]) -> str | None:

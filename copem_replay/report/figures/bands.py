@@ -65,7 +65,7 @@ def resampled_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> 
         )
         before, after = (np.searchsorted(time_s, lost_s, side=side) for side in ("left", "right"))
         gone, remaining = lost[:, after] - lost[:, before], total - until[:, after]
-        # Who is censored hands his weight on to all who remain; where nobody does, nobody takes it over.
+        # A censored row hands its weight on to all that remain; where none does, it is not handed on.
         factors = np.divide(gone, remaining, out=np.zeros_like(gone), where=remaining > 0) + 1.0
         handed = np.concatenate([np.ones((len(count), 1)), np.cumprod(factors, axis=1)], axis=1)
         weight *= handed[:, np.searchsorted(lost_s, time_s, side="left")]

@@ -121,7 +121,7 @@ def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Detect
 def exact_curve(exact: pd.DataFrame, name: str) -> DetectionCurve:
     """The probability of being detected by then, every log and object counting the same.
 
-    Not the estimator of the runs' curves, which hands the weight of who is censored on to all who remain: be it a
+    Not the estimator of the runs' curves, which hands the weight of censored rows on to all that remain: be it a
     millionth of one, as none of the runs has it.
     """
     rows = exact[exact["configuration"] == name]

@@ -132,7 +132,7 @@ def _panel(
         distance_m = rows[column].to_numpy(dtype=float)
         placed = known & ~np.isnan(distance_m)
         lost += int((known & ~placed).sum())
-        # Who brakes for the one event has nothing to show at the distance of the other.
+        # A driver that brakes for the one event has no verdict at the distance of the other.
         kind = verdicts(rows).to_numpy() if judged else np.full(len(rows), NEUTRAL, dtype=object)
         across = k - _HALF * spread(distance_m[placed], list(kind[placed]), top_m / _BINS)
         never = int((~known).sum())

@@ -9,7 +9,7 @@
 | transport | there | its arrival (`arrived_s`): captured plus latency where there is neither link nor `ready` |
 | fusion | there | the fused list with which it was known (`detection_s`) |
 
-Means over the rows that were detected, so that stages add up. An object listed while nobody had it in sight was hidden
+Means over the rows that were detected, so that stages add up. An object listed while no unit had it in sight was hidden
 until it was listed. Of a confirmation only the newest capture is known: what it takes is spent *in sight*, as is the
 time in which another unit's list of the object is still on its way; `listed` where lists have a way that is told
 (`metrics/way.py`). Where they have not, ideal fusion and the truth know from the list that brings it (one hit): all

@@ -1,4 +1,4 @@
-"""What figures show of many: whose run, which one, and which configurations where not all have a place."""
+"""Selection for figures: which object and run, and which configurations where not all have a place."""
 
 from __future__ import annotations
 

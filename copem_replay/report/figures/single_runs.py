@@ -105,7 +105,7 @@ def _courses(
     gap.axhline(experiment.braking.margin_m, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), label="margin")
     for axes, thin, thick in ((speed, free.speed_mps, course.speed_mps), (gap, free.gap_m, course.gap_m)):
         axes.plot(since_s, thin, color=FAINT, linewidth=1.0, label="does not brake")
-        drawn = np.where(since_s < 0, thin, thick)[kept]  # until the onset nobody brakes
+        drawn = np.where(since_s < 0, thin, thick)[kept]  # until the onset the ego does not brake
         axes.plot(since_s[kept], drawn, label="brakes", **own)
         if np.isfinite(told.impact_s):
             axes.plot(since_s[kept][-1:], drawn[-1:], "X", color=INK, markersize=6, label="hits")

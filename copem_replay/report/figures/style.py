@@ -140,7 +140,7 @@ def _luminance(colour: Colour) -> float:
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Our settings of matplotlib while a figure is made or written, whatever the user's are."""
+    """The package's settings of matplotlib while a figure is made or written, whatever the user's are."""
     import matplotlib
 
     with matplotlib.rc_context():

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 def write_figures(results: Results, folder: Path | None, selection: Selection) -> tuple[list[Path], list[str]]:
     """Write all figures of a results folder into `folder`, by default its `figures`.
 
-    Returns the files, and what has to be said: a figure that cannot be made is left out. Figures of ours that are there
-    already are replaced, and go where they can no longer be made. Raises InputError for what is not among the results,
-    OutputError where nothing can be written.
+    Returns the files, and what has to be said: a figure that cannot be made is left out. Figures of this package that
+    are there already are replaced, and go where they can no longer be made. Raises InputError for what is not among the
+    results, OutputError where nothing can be written.
     """
     choose(results, selection)  # refused before anything is drawn
     folder = results.folder / "figures" if folder is None else folder

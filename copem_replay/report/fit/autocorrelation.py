@@ -24,10 +24,10 @@ def autocorrelation_figure(study: FitStudy) -> Figure:
     fit, z = study.errors, study.errors.shape.z
     series = series_of(study.rows.take(fit.rows))
     period_s = float(np.median(series.gap_s[~series.new]))
-    whose, at_s = np.cumsum(series.new) - 1, study.rows.captured_s[fit.rows]
+    series_ix, at_s = np.cumsum(series.new) - 1, study.rows.captured_s[fit.rows]
     far_s = min(max(20 * period_s, 4 * fit.shares.tau_s if fit.shares.drift else 0), 200 * period_s)
     lags = np.unique(np.geomspace(1, max(far_s / period_s, 2), _LAGS).round().astype(np.int64))
-    found, n = _correlations(z, whose, at_s, lags, period_s)
+    found, n = _correlations(z, series_ix, at_s, lags, period_s)
     names = ("along", "across") if fit.frame == "line_of_sight" else ("easting", "northing")
     with style():
         figure = new_figure(6.4, 3.6)
@@ -52,11 +52,11 @@ def autocorrelation_figure(study: FitStudy) -> Figure:
     return figure
 
 
-def _correlations(z: Float, whose: Int, at_s: Float, lags: Int, period_s: float) -> tuple[Float, Int]:
+def _correlations(z: Float, series_ix: Int, at_s: Float, lags: Int, period_s: float) -> tuple[Float, Int]:
     """(lags, 2) mean products of errors so many periods apart, ± a half, of variance 1, and how many."""
     out, n = np.zeros((len(lags), 2)), np.zeros(len(lags), dtype=np.int64)
     z = z / np.sqrt((z**2).mean(axis=0))
-    key = 2 * (at_s[-1] - at_s[0] + np.ptp(at_s) + 1) * whose + at_s  # one axis of time on which series do not meet
+    key = 2 * (at_s[-1] - at_s[0] + np.ptp(at_s) + 1) * series_ix + at_s  # one axis of time on which series do not meet
     for k, lag in enumerate(lags):
         later = np.searchsorted(key, key + (lag - 0.5) * period_s)
         later = np.minimum(later, len(key) - 1)

@@ -21,10 +21,10 @@ def calibration_figure(study: FitStudy) -> Figure:
     """The share listed over the fitted probability, a point with its interval for each bin."""
     p, hit, worth = study.probability, study.rows.listed, max(study.detection.rows_per_effective, 1.0)
     edges = np.unique(np.quantile(p, np.linspace(0, 1, BINS + 1)))
-    whose = np.clip(np.searchsorted(edges, p, side="right") - 1, 0, max(len(edges) - 2, 0))
-    n = np.bincount(whose)
+    bin_ix = np.clip(np.searchsorted(edges, p, side="right") - 1, 0, max(len(edges) - 2, 0))
+    n = np.bincount(bin_ix)
     there = np.flatnonzero(n)
-    n, said, share = n[there], *(np.bincount(whose, of)[there] / n[there] for of in (p, hit))
+    n, said, share = n[there], *(np.bincount(bin_ix, of)[there] / n[there] for of in (p, hit))
     k = share * n / worth
     low, high = beta.ppf([[0.025], [0.975]], k + 0.5, n / worth - k + 0.5)
     with style():
@@ -49,6 +49,6 @@ CALIBRATION = FitFigure(
     "share of rows that are listed over the fitted probability, with intervals, beside the diagonal",
     "Rows (a list and a true object within reach) are put into bins by the probability that the fitted model gives "
     "them. Points on the dashed line: as many are listed as the model says. Intervals count rows that hang together "
-    "for less. A point whose bar misses the line is a place where the model is wrong.",
+    "for less. A point bin_ix bar misses the line is a place where the model is wrong.",
     calibration_figure,
 )

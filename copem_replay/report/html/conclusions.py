@@ -84,11 +84,11 @@ def _soonest(study: Study) -> Html:
     rest = len(study.lead.configurations) + 1 - len(same)
     undecided = sum(name not in same for rows in (alike, sooner) for name in rows["configuration"])
     others = f"the other {rest}" if rest > 1 else "the other"
-    whom = f" {others[:1].upper()}{others[1:]} {'are' if rest > 1 else 'is'} below." if rest else ""
+    below = f" {others[:1].upper()}{others[1:]} {'are' if rest > 1 else 'is'} below." if rest else ""
     if undecided:
         to = others if undecided == rest else f"{undecided} of {others}"
-        whom = f" The interval of their difference to {to} includes 0."
-    return joined([_missing(study, unsure), tag("b", together(same)), f" detect {when}.{whom}"])
+        below = f" The interval of their difference to {to} includes 0."
+    return joined([_missing(study, unsure), tag("b", together(same)), f" detect {when}.{below}"])
 
 
 def _elsewhere(study: Study) -> Iterator[str]:
@@ -123,12 +123,12 @@ def _first(study: Study, name: Html, mean_s: float, counted_as: str) -> Html:
         names = tag("b", together([str(study.best), *level]))
         return joined([before, names, f" have the same mean time, {plain(mean_s)} s{counted_as}, though they do not "
                        "always detect at the same time."])  # fmt: skip
-    whom = f"the other {others}" if others > 1 else study.lead.configurations[0]
+    rivals = f"the other {others}" if others > 1 else study.lead.configurations[0]
     has, sure = f" has the shortest mean time, {plain(mean_s)} s", ""
     if len(later) == others:
-        has, sure = f" detects soonest, after {plain(mean_s)} s on average", f", sooner than {whom}"
+        has, sure = f" detects soonest, after {plain(mean_s)} s on average", f", sooner than {rivals}"
     elif undecided:
-        to = f"{undecided} of {whom}" if undecided < others else whom
+        to = f"{undecided} of {rivals}" if undecided < others else rivals
         sure = f", but the interval of its difference to {to} includes 0"
     return joined([before, name, f"{has}{counted_as}{sure}."])
 
@@ -205,9 +205,9 @@ def _detected(study: Study, share: pd.Series) -> Iterator[str]:
         worst, least = max(missed, key=lambda one: one[1]), min(missed, key=lambda one: one[1])
         rows = "of the rows (objects × runs)"
         if per_cent(worst[1]) == per_cent(least[1]):
-            whom = together([name for name, _ in missed])
+            named = together([name for name, _ in missed])
             yield (
-                f"{whom} {'each miss' if len(missed) > 1 else 'misses'} {per_cent(worst[1])} % {rows}; Never detected "
+                f"{named} {'each miss' if len(missed) > 1 else 'misses'} {per_cent(worst[1])} % {rows}; Never detected "
                 "names the objects."
             )
         else:

@@ -1,4 +1,4 @@
-"""HTML as text, of which only what we wrote ourselves is taken literally."""
+"""HTML as text, of which only the package's own is taken literally."""
 
 from __future__ import annotations
 

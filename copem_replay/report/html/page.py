@@ -87,7 +87,7 @@ def _figures(study: Study, names: Sequence[str]) -> Iterator[_Section]:
 
 
 def _key(study: Study) -> Html:
-    """Which line is whose; pressed to leave a configuration out of all figures."""
+    """The line of each configuration; pressed to leave a configuration out of all figures."""
     buttons = [
         tag("button", swatch(look), name, type="button", aria_pressed="true", data_configuration=str(k))
         for k, (name, look) in enumerate(study.looks.items())

@@ -48,15 +48,15 @@ def question(study: Study) -> str:
     experiment = study.results.experiment
     measure = experiment.measure
     if measure.objects.ids is not None:
-        whom = f"object {together(measure.objects.ids)}"
+        them = f"object {together(measure.objects.ids)}"
     elif measure.objects.classes is not None:
-        whom = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
+        them = f"each measured {' or '.join(_CLASSES.get(name, name) for name in measure.objects.classes)}"
     else:
-        whom = "each object that moves"
+        them = "each object that moves"
     which = f"each of {len(study.names)} configurations" if len(study.names) > 1 else "the one configuration"
     far = "" if experiment.measure.distance_to != "ego" or experiment.ego == "none" else ", and how far away,"
     return (
-        f"On {logs(study)}: how soon{far} is {whom} known to the receiver, with {which} of perception units, latencies "
+        f"On {logs(study)}: how soon{far} is {them} known to the receiver, with {which} of perception units, latencies "
         "and fusion?"
     )
 

@@ -1,4 +1,4 @@
-"""What a report is made of: the results, where they come from, and who is compared with whom."""
+"""Data of a report: the results, where they come from, and their comparison with the baseline."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What units get wrong beside what their PEMs say of single entries, in a sentence each. Empty where they do not."""
+"""Errors of units beside those that their PEMs make in single entries, a sentence each. Empty where there are none."""
 
 from __future__ import annotations
 

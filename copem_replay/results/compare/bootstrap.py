@@ -1,8 +1,8 @@
 """Intervals of differences: which clusters are resampled whole, and with which draws.
 
-The clusters are those of `summary.csv`, resampled alike: logs, if there are at least five; else measured
-objects, if there are at least five; runs, where there is one object in one log. With fewer there is no interval: more
-runs do not tell about other traffic, and few of anything do not tell how it varies.
+The clusters are those of `summary.csv`, resampled alike: logs, if there are at least five; else measured objects, if
+there are at least five; runs, where there is one object in one log. With fewer there is no interval: more runs of the
+same traffic do not narrow it, and few clusters do not show how they vary.
 """
 
 from __future__ import annotations

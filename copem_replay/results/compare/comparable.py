@@ -1,4 +1,4 @@
-"""What results must have in common to be compared: the recordings, the dice, and what is measured how."""
+"""What results must have in common to be compared: the recordings, the random numbers, and what is measured how."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _problems(first: Results, other: Results) -> Iterator[str]:
         yield from other_logs
     for key in ("seed", "window_s", "max_gap_s"):
         yield from _differs(first, other, key, getattr(before, key), getattr(after, key))
-    # As written: whom `null` stands for is in the logs.
+    # As written: the ego that `null` stands for is in the logs.
     if other_logs or not by_truth(first, other):  # whose truths are the same have the same ego
         yield from _differs(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
     for key in _MEASURE:

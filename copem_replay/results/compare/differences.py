@@ -136,8 +136,8 @@ class OfTimes(Figure):
     def _means(self, part: Items, clusters: Clusters, count: Counts) -> Float:
         """(R,) restricted means: `cumulative_incidence` for all resamples at once.
 
-        Its steps weigh by what the censored before them hand on. Times at which somebody is censored are few, those of
-        objects: between two of them sums over clusters are enough.
+        Its steps weigh by what the censored before them hand on. Times of censoring are few, those of objects: between
+        two of them sums over clusters are enough.
         """
         time_s, ending, n, of = part["time_s"], part["ending"], part["n"], clusters.of(part)
         censored = ending == CENSORED

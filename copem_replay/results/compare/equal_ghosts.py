@@ -1,7 +1,7 @@
 """At which ghosts per minute times are compared, and where that says nothing, and why.
 
-Ghosts are here those that were about nobody at the instant they tell of either: a late list that was right then is not
-cleaner for being left out. A side is *thinned* where it has more of them than is asked for.
+Ghosts are here those that were about no object at the instant they tell of either: a late list that was right then is
+not cleaner for being left out. A side is *thinned* where it has more of them than is asked for.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What one configuration loses or gains against another, metric by metric, over the rows and lists that both have.
+"""Differences of two configurations, metric by metric, over the rows and lists that both have.
 
 Rows are paired by log, object and run, lists by instant; differences are first − second. Definitions are those of
 `summary.csv`, but for what pairs allow:
 
 *ttd_rmst_s*: the difference of the two restricted means over the rows that both have; never detected counts as the
-horizon, who was still there when we stopped looking is censored.
+horizon, an object still there when observation ends is censored.
 *dad_median_m*: the median of the differences, not the difference of the medians. Never detected is below every
 distance, so it differs infinitely from a distance, and not at all from never.
 *gospa_m*: a list counts where an object is measured in it, on or after its onset.

@@ -49,9 +49,9 @@ def notes_on_pairs(baseline: Named, pairs: Mapping[Named, AllLogs]) -> Iterator[
     """Rows without a partner."""
     for one, pair in pairs.items():
         counts = np.sum(pair.alone, axis=0).tolist()
-        for (whose, other), count in zip(((one, baseline), (baseline, one)), counts, strict=True):
+        for (one_side, other), count in zip(((one, baseline), (baseline, one)), counts, strict=True):
             if count:
-                yield f"{counted(count, 'row')} of {whose.label} left out: {other.label} has no such object"
+                yield f"{counted(count, 'row')} of {one_side.label} left out: {other.label} has no such object"
 
 
 def notes_on_instants(baseline: Named, pairs: Mapping[Named, AllLogs], logs: Sequence[str]) -> Iterator[str]:
@@ -71,7 +71,7 @@ def notes_on_instants(baseline: Named, pairs: Mapping[Named, AllLogs], logs: Seq
 
 
 def note_on_measuring(baseline: Named, others: Sequence[Named]) -> Iterator[str]:
-    """Who detects by truth id where the others have to be matched."""
+    """Configurations that detect by truth id where the others have to be matched."""
     by_id = [one for one in (baseline, *others) if one.configuration in one.results.by_truth_id]
     if by_id and len(by_id) <= len(others):
         yield (

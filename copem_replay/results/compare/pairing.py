@@ -31,7 +31,7 @@ class Grid:
     before: int = 0
 
     def cells(self, table: pa.Table) -> Int:
-        """(n,) the cell of each row of a table, −1: a run that is not compared, or an object nobody measured."""
+        """(n,) the cell of each row of a table, −1: a run that is not compared, or an object that is not measured."""
         import pyarrow as pa
         import pyarrow.compute as pc
 

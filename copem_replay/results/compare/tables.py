@@ -105,7 +105,7 @@ def plain(value: float) -> str:
 
 
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
-    """What the table shows, and who is better than the baseline."""
+    """What the table shows, and which are better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
     yield f"differences to {comparison.baseline}, paired by log, object and run; accuracy at instants that both have"
