@@ -16,10 +16,8 @@ from copem_replay.core.tracks import Float
 
 
 @nb.njit(cache=True, nogil=True)
-def predict(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
-    """Lets `dt_s` ≥ 0 pass: x ← F x, P ← F P Fᵀ + Q."""
-    for i in range(2):
-        state[i] += dt_s * state[2 + i]
+def carry(P: Float, dt_s: float) -> None:
+    """Lets `dt_s` ≥ 0 pass: P ← F P Fᵀ, in place, without acceleration."""
     for i in range(2):
         for j in range(2):
             P[i, j] += dt_s * (P[i, 2 + j] + P[2 + i, j]) + dt_s * dt_s * P[2 + i, 2 + j]
@@ -27,6 +25,14 @@ def predict(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
         for j in range(2):
             P[i, 2 + j] += dt_s * P[2 + i, 2 + j]
             P[2 + j, i] = P[i, 2 + j]
+
+
+@nb.njit(cache=True, nogil=True)
+def predict(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
+    """Lets `dt_s` ≥ 0 pass: x ← F x, P ← F P Fᵀ + Q."""
+    for i in range(2):
+        state[i] += dt_s * state[2 + i]
+    carry(P, dt_s)
     for i in range(2):
         P[i, i] += q_m2ps3 * dt_s**3 / 3
         P[i, 2 + i] += q_m2ps3 * dt_s**2 / 2

@@ -19,9 +19,9 @@ from copem_replay.core.object_list import ENTRY, Entries
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, Bool, Float, Int
 from copem_replay.fusion.content_order import compare_rows
 from copem_replay.fusion.covariance import floored
-from copem_replay.fusion.tracker_filter import distance2, predict, update
+from copem_replay.fusion.tracker_filter import carry, distance2, predict, update
 from copem_replay.fusion.tracker_memory import CLAIM, TRACK, Memory, Remembered, recalled, remembered
-from copem_replay.fusion.tracker_split import carry, update_split
+from copem_replay.fusion.tracker_split import update_split
 
 STALE, PREDICT, REPLAY = 0, 1, 2
 ENTRIES_PER_LIST = 65536

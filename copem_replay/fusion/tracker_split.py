@@ -27,18 +27,6 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 @nb.njit(cache=True, nogil=True)
-def carry(common: Float, dt_s: float) -> None:
-    """Lets `dt_s` ≥ 0 pass: C ← F C Fᵀ, in place. Acceleration is independent of everything."""
-    for i in range(2):
-        for j in range(2):
-            common[i, j] += dt_s * (common[i, 2 + j] + common[2 + i, j]) + dt_s * dt_s * common[2 + i, 2 + j]
-    for i in range(2):
-        for j in range(2):
-            common[i, 2 + j] += dt_s * common[2 + i, 2 + j]
-            common[2 + j, i] = common[i, 2 + j]
-
-
-@nb.njit(cache=True, nogil=True)
 def update_split(state: Float, P: Float, common: Float, seen: Float, share: float, grown: float) -> None:
     """Takes in a measured position, in place. `seen`: x, y, ee, en, nn; the independent part of R counts `grown` times.
 

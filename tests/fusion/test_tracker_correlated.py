@@ -15,7 +15,8 @@ from scipy.optimize import minimize_scalar
 
 from copem_replay.core.object_list import Entries, Inputs
 from copem_replay.fusion.tracker import Tracker
-from copem_replay.fusion.tracker_split import carry, update_split
+from copem_replay.fusion.tracker_filter import carry
+from copem_replay.fusion.tracker_split import update_split
 from tests.fusion.test_tracker import LATE, fuse, fuse_one, street
 from tests.helpers.reports import entry, inputs_of
 
