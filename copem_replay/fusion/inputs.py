@@ -28,11 +28,6 @@ class Claims:
     track_id: Int
 
 
-def lists_without_truth(heard: Tracks, claims: Claims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
-    """The lists of all units in all runs, F in each of S. `drawn (S, P)`: by what entries of a list are ordered."""
-    return RowEntries(heard, claims).lists(heard, drawn, without_object_ix=without_object_ix)
-
-
 class RowEntries:
     """Rows (P,) of lists in the runs (S,) as entries: what of them is the same in all runs is made once."""
 
@@ -42,7 +37,7 @@ class RowEntries:
         self._template = _template(seen, claims, self._columns)
 
     def lists(self, seen: Tracks, drawn: Float, s: int | None = None, *, without_object_ix: int) -> ObjectLists:
-        """The lists of all runs, or of run s alone: `seen` and `drawn` are of that, too."""
+        """The lists of all runs, or of run s alone: `seen` and `drawn` are of that, too. `drawn` orders entries."""
         start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
         entries = taken(self._template, picked)
         run = np.repeat(np.arange(len(start)) if s is None else s, start[:, -1] - start[:, 0])

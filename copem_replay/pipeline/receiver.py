@@ -23,7 +23,7 @@ from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
 from copem_replay.fusion.ideal import draw_posterior, fuse, kept_by_object
-from copem_replay.fusion.inputs import Claims, RowEntries, inputs, listed_rows, lists_without_truth, with_kept
+from copem_replay.fusion.inputs import Claims, RowEntries, inputs, listed_rows, with_kept
 from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.outages import without_outages
@@ -316,7 +316,7 @@ def _without_truth(
         )
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
     drawn = rng.uniform("order in the list", random_key, runs)
-    lists = lists_without_truth(seen, claims, drawn, without_object_ix=ego)
+    lists = RowEntries(seen, claims).lists(seen, drawn, without_object_ix=ego)
     if not experiment.partial:
         return lists, none
     picked = listed_rows(seen, drawn, without_object_ix=ego)[1]
