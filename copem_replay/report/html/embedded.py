@@ -5,16 +5,12 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from copem_replay.report.figures.registry import FigureKind
 from copem_replay.report.figures.render import rendered
-from copem_replay.report.figures.selection import Selection
 from copem_replay.report.html.greys import as_variables
 from copem_replay.report.html.markup import Html, tag
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from copem_replay.results.read import Results
 
 _NOT_DRAWN = re.compile(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style .*?</style>\s*", re.DOTALL)
 _IDS = re.compile(r'(?<= id=")|(?<=xlink:href="#)|(?<=url\(#)')
@@ -27,13 +23,8 @@ def _larger(size: re.Match[str]) -> str:
     return f'{size[1]}style="width: {_LARGER * float(size[2]):.0f}pt"'
 
 
-def embedded(name: str, kind: FigureKind, results: Results, selection: Selection) -> Html:
-    """A figure as an element of a page, as wide as it was drawn where there is room. Raises RecordingError."""
-    return drawn(name, kind.draw(results, selection), kind.title, kind.shows)
-
-
 def drawn(name: str, figure: Figure, title: str, shows: str) -> Html:
-    """A figure that has been made as an element of a page; `shows`: for readers who cannot see it."""
+    """A figure as an element of a page, as wide as it was drawn where there is room; `shows`: for screen readers."""
     svg = rendered(figure, (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # texts are in comments, too: as users wrote them
     svg = as_variables(_SIZE.sub(_larger, _IDS.sub(f"{name}-", svg), count=1))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
 from copem_replay.report.html.conclusions import lead, more
-from copem_replay.report.html.embedded import embedded
+from copem_replay.report.html.embedded import drawn
 from copem_replay.report.html.latency_breakdown import stage_table
 from copem_replay.report.html.markup import Html, joined, tag
 from copem_replay.report.html.missed_objects import never_detected, without_a_draw
@@ -61,7 +61,8 @@ def page(study: Study) -> str:
 
 
 def _embedded(study: Study, name: str) -> Html:
-    return embedded(name, FIGURES[name], study.results, Selection(differences=study.regret))
+    kind = FIGURES[name]
+    return drawn(name, kind.draw(study.results, Selection(differences=study.regret)), kind.title, kind.shows)
 
 
 def _differences(study: Study) -> list[Html]:
