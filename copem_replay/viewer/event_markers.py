@@ -137,7 +137,7 @@ def on_curves(
     out: Out, replay: Replay, experiment: Experiment, table: pd.DataFrame, name: str, curves: Mapping[str, Curve],
     colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
-    """The same instants on the curves of the object `name`: a detection on the curve of those who made it.
+    """The same instants on the curves of the object `name`: a detection on the curve of its units.
 
     An entity has one colour at an instant: marks of the same one are on several, smaller ones on larger ones. One per
     configuration would cost more than all curves.
