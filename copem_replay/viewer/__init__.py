@@ -7,8 +7,7 @@
 | `world/static/obstacles`, `grid` | obstacles, and lines on the ground every 10 m |
 | `world/units/<unit>`, `world/fields/<unit>` | units, and the fields of view of their PEMs |
 | `world/<configuration>/boxes`, `covariance` | the receiver's fused tracks, paler the older; 2σ of where |
-| `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; the unit that listed
-  it first |
+| `world/<configuration>/status`, `hiding`, `listings` | at each: known or why not; what hides it; its first unit |
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where it was first known, and from how far away |
 | `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow |
 | `lanes/<object>/<place>_<configuration>` | how far it has come (`viewer/status.py`), a mark at the onset |
