@@ -31,9 +31,13 @@ def main() -> None:
     limit = (1 - P) * math.exp(-P * AFTER_S / TAU_S)
     print(f"| without end | 0 | | {limit:.3f} = (1 − p) e^(−p t / τ) | |")
     print()
-    print("| of thirty lists at 10 Hz, p rising evenly from 0 to .55 | never detected with probability |")
+    print("| thirty lists at 10 Hz, p rising evenly from 0 to .55 | probability that none detects the object |")
     print("|---|---|")
-    for said, share in (("all are new", 0.0), ("60 % go by a number held .8 s", 0.6), ("all do", 1.0)):
+    for said, share in (
+        ("all lists are drawn anew", 0.0),
+        ("60 % of the lists use a number held for .8 s", 0.6),
+        ("all lists use it", 1.0),
+    ):
         print(f"| {said} | {never(share):.5f} |")
 
 
