@@ -42,17 +42,17 @@ USUAL_MPS2, GIVE_MPS2 = 8.0, 1.0
 INTRODUCTION: Final = """\
 # Calibrated reproduction of the paper's success rates
 
-Printed by `python tools/calibrate_tc016d.py`. The paper gives six success rates, but neither its driver nor its
-geometry. Four numbers of `logs/tc016d` are therefore fitted to these very rates, so that they agree is no evidence for
-the model. What the table shows is that one driver and one geometry are compatible with all six at once; what they
-predict for other latencies, units and rates is as good as that driver. Maximum likelihood of the paper's counts given
-our exact rates, with a_max held near what cars do."""
+`python tools/calibrate_tc016d.py` prints this page. The paper gives six success rates, but neither its driver nor its
+geometry. Four numbers of `logs/tc016d` are therefore fitted to these very rates, so agreement is no evidence for the
+model. The table only shows that one driver and one geometry are compatible with all six rates at once. Predictions for
+other latencies, units and rates are as good as that driver. The fit maximises the likelihood of the paper's counts
+given our exact rates, with a_max held near that of real cars."""
 
 WHAT_IS_OPEN: Final = f"""\
 ## What the rates leave open
 
-A driver who brakes harder but reacts later does as well: the six rates hardly tell them apart (a difference below 3.8
-is no evidence at 95 %). So a_max is held near full braking on dry asphalt,
+A driver that brakes harder but reacts later fits as well: the six rates hardly distinguish them (a difference below
+3.8 is no evidence at 95 %). So a_max is held near full braking on dry asphalt,
 {USUAL_MPS2:g} ± {GIVE_MPS2:g} m/s² (chosen)."""
 
 
