@@ -10,12 +10,13 @@ import typer
 from copem_replay.core.errors import InputError, printable
 
 app = typer.Typer(
-    help="Convert a data set or a simulation to a recording.\n\nOf OSI truth, as MCAP.", rich_markup_mode=None
-)  # fmt: skip
+    help="Convert a data set or a simulation to a recording.\n\nIt is an MCAP file with OSI ground truth.",
+    rich_markup_mode=None,
+)
 
 Source = Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of the format.")]
 Out = Annotated[Path, typer.Option(metavar="FILE", help="Recording to write (.mcap).")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there already.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")]
 Metres = tuple[float, float, float]
 
 
@@ -33,7 +34,7 @@ def argoverse2(
     out: Out,
     overwrite: Overwrite = False,
     ego_size_m: Annotated[
-        Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Of the ego vehicle [4.877 2 1.473].")
+        Metres | None, typer.Option(metavar="LENGTH WIDTH HEIGHT", help="Size of the ego vehicle [4.877 2 1.473].")
     ] = None,
     centre_from_rear_axle_m: Annotated[
         Metres | None,
@@ -53,7 +54,7 @@ def argoverse2(
 @app.command()
 def scenarionet(
     source: Source,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Recording to write; of a folder: another folder.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Recording to write; for a folder, a folder.")],
     overwrite: Overwrite = False,
     ego_centre_m: Annotated[
         float | None,
@@ -72,7 +73,7 @@ def openlabel(
     source: Source,
     out: Out,
     overwrite: Overwrite = False,
-    rate_hz: Annotated[float | None, typer.Option(metavar="HZ", help="Of frames without time stamps.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(metavar="HZ", help="Rate of frames without time stamps.")] = None,
     from_system: Annotated[
         str | None, typer.Option("--from", metavar="SYSTEM", help="Coordinate system of cuboids that name none.")
     ] = None,

@@ -14,7 +14,7 @@ from copem_replay.cli.terminal import note, say, say_blocks
 
 def fit(
     experiment: ExperimentFile,
-    unit: Annotated[str, typer.Option(metavar="NAME", help="Unit whose lists are recorded.")],
+    unit: Annotated[str, typer.Option(metavar="NAME", help="Unit with recorded lists.")],
     hold_out: Annotated[
         list[str] | None,
         typer.Option("--hold-out", metavar="LOG", help="Keep this log for the check. May be repeated."),
@@ -24,14 +24,14 @@ def fit(
     ] = None,
     truth: Annotated[
         str | None,
-        typer.Option(metavar="KIND", help="partial: entries may be about objects that the truth lacks; or complete."),
+        typer.Option(metavar="KIND", help="partial: the truth may lack objects of entries; complete: it has all."),
     ] = None,
     by: Annotated[
         str, typer.Option(metavar="A,B,…", help="What detection depends on: range, visible_share, azimuth, class.")
     ] = "range,visible_share",
-    simplest: Annotated[bool, typer.Option("--simplest", help="Take the simplest model of every ladder.")] = False,
+    simplest: Annotated[bool, typer.Option("--simplest", help="Take the simplest of the candidate models.")] = False,
     not_monotone: Annotated[
-        bool, typer.Option("--not-monotone", help="Farther and more hidden may be better.")
+        bool, typer.Option("--not-monotone", help="Detection may improve with range and occlusion.")
     ] = False,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder of the fit [out/<experiment>_fit].")
@@ -40,8 +40,8 @@ def fit(
 ) -> int:
     """Fit a perception error model to recorded lists.
 
-    Every number comes with an interval, or the reason why it cannot be told. The exit code is 1 where the replay of the
-    fitted model is unlike what was recorded.
+    Every number comes with an interval, or with the reason why the data cannot determine it. The exit code is 1 if the
+    fitted model fails its replay check.
     """
     from copem_replay.cli.api.fit import fill, fitted, how_of, study_to_fit
     from copem_replay.experiment.file import load

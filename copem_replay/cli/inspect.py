@@ -92,7 +92,7 @@ def check(
 ) -> int:
     """Report every problem of an experiment, with file and line.
 
-    All at once, and against its recordings, too.
+    It reports all problems at once, and checks the experiment against its recordings, too.
     """
     from copem_replay.cli.api.study import prepared, read_study
 
@@ -108,7 +108,7 @@ def check(
 def schema() -> int:
     """Print the JSON Schema of the experiment file.
 
-    With all components that are installed.
+    It includes all installed components.
     """
     from copem_replay.experiment.schema import Experiment
 

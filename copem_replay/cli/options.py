@@ -19,14 +19,14 @@ Logs: TypeAlias = Annotated[
 Ego: TypeAlias = Annotated[str | None, typer.Option("--ego", metavar="ID", help="Id of the ego vehicle.")]
 FromS: TypeAlias = Annotated[
     float | None,
-    typer.Option("--from", metavar="SECONDS", help="Start of the window that is read, since the log starts [0]."),
+    typer.Option("--from", metavar="SECONDS", help="Start of the window to read, since the log's start [0]."),
 ]
 ToS: TypeAlias = Annotated[
     float | None,
-    typer.Option("--to", metavar="SECONDS", help="End of the window that is read, since the log starts [its end]."),
+    typer.Option("--to", metavar="SECONDS", help="End of the window to read, since the log's start [its end]."),
 ]
 OneDrive: TypeAlias = Annotated[
-    bool, typer.Option("--together", help="The recordings are of one drive: how far are their clocks apart?")
+    bool, typer.Option("--together", help="The recordings are of one drive: estimate their clock offsets.")
 ]
 Baseline: TypeAlias = Annotated[
     str | None, typer.Option("--baseline", metavar="NAME", help="Configuration to compare with [the one named ideal].")

@@ -28,12 +28,15 @@ def compare(
         typer.Option(metavar="N", min=0, help="Ghosts per minute at which times are compared [the baseline's]."),
     ] = None,
     rrd: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write one run of all of them as a Rerun recording (.rrd).")
+        Path | None,
+        typer.Option(metavar="FILE", help="Write one run of all configurations as a Rerun recording (.rrd)."),
     ] = None,
     run: Annotated[
         int | None, typer.Option(metavar="N", help="Run in that recording [as in the baseline's replay.rrd].")
     ] = None,
-    log: Annotated[str | None, typer.Option(metavar="NAME", help="Log in that recording [likewise].")] = None,
+    log: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Log in that recording [as in that replay.rrd].")
+    ] = None,
 ) -> int:
     """Compare configurations with a baseline, with intervals.
 
@@ -72,9 +75,11 @@ def plot(
     folder: ResultsFolder,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the figures [FOLDER/figures].")] = None,
     configurations: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help="Only these [all; of single runs four of them].")
+        str | None, typer.Option(metavar="A,B,…", help="Only these [all; four of them for single runs].")
     ] = None,
-    run: Annotated[int | None, typer.Option(metavar="N", help="Run in the figure [as in replay.rrd].")] = None,
+    run: Annotated[
+        int | None, typer.Option(metavar="N", help="Run in the figure of single runs [as in replay.rrd].")
+    ] = None,
     object: Annotated[
         str | None, typer.Option(metavar="ID", help="Object in the figure of single runs [the first in conflict].")
     ] = None,
@@ -105,7 +110,7 @@ def report(
 ) -> int:
     """Write the report of a results folder, as one HTML file.
 
-    Words, tables, figures and provenance; it opens offline.
+    It has text, tables, figures and provenance, and opens offline.
     """
     from copem_replay.cli.api.results import write_report
 
@@ -118,15 +123,15 @@ def report(
 def layout(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Results folder, or a replay.mcap.")],
     configurations: Annotated[
-        str | None, typer.Option("--compare", metavar="A,B,…", help="These over each other, and each alone.")
+        str | None, typer.Option("--compare", metavar="A,B,…", help="Show these over each other, and each alone.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The layout [beside the replay, as .foxglove.json].")
+        Path | None, typer.Option(metavar="FILE", help="Name of the layout [beside the replay, as .foxglove.json].")
     ] = None,
 ) -> int:
     """Write a layout of a replay, for Foxglove and Lichtblick.
 
-    The configurations side by side over the truth, cameras in step; under them when each knows an object.
+    It shows the configurations side by side over the truth, with linked cameras, and when each knows an object.
     """
     from copem_replay.core.files import atomic_file
     from copem_replay.io.write.foxglove_layout import layout_of

@@ -39,13 +39,13 @@ def run(
     ] = False,
     pieces: Annotated[
         str | None,
-        typer.Option(metavar="FOLDER", help="Where finished pieces are kept, and found again: a folder or a URL."),
+        typer.Option(metavar="FOLDER", help="Keep finished pieces here, and reuse them: a folder or a URL."),
     ] = None,
     cluster: Annotated[
         str | None,
         typer.Option(
             metavar="WHERE",
-            help="Processes in place of threads, by Dask: local, local:N, tcp://HOST:PORT, tls://… or scheduler.json.",
+            help="Use Dask processes instead of threads: local, local:N, tcp://HOST:PORT, tls://… or scheduler.json.",
         ),
     ] = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html.")] = False,

@@ -16,7 +16,7 @@ _SAMPLES: Final = Path(__file__).with_name("sample_logs")
 
 
 def samples(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where they go.")] = Path("logs"),
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write to.")] = Path("logs"),
 ) -> int:
     """Write the sample recordings and experiments into a folder.
 

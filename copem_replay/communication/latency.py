@@ -65,7 +65,7 @@ class ConstantLatency(LatencyModel):
 
 
 class GammaLatency(LatencyModel):
-    """At least `min_s`; what is beyond is gamma distributed, so that the mean is `mean_s`."""
+    """`min_s` plus a gamma distributed time; the mean of the sum is `mean_s`."""
 
     kind: Literal["gamma"] = "gamma"
     min_s: Latency = 0.0
@@ -87,7 +87,7 @@ class GammaLatency(LatencyModel):
 
 
 class LognormalLatency(LatencyModel):
-    """At least `min_s`; what is beyond is log-normal, with the median `median_s` and `sigma` of its logarithm."""
+    """`min_s` plus a log-normal time with median `median_s` and standard deviation `sigma` of its logarithm."""
 
     kind: Literal["lognormal"] = "lognormal"
     min_s: Latency = 0.0

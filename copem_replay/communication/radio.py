@@ -26,10 +26,10 @@ from copem_replay.core.tracks import Bool, Float, Int
 
 
 class Channel(Frozen):
-    """What a unit sends by one list after the other: a list waits for those before it, and takes its time in the air.
+    """A channel that sends a unit's lists one after the other: a list waits for earlier ones, then takes its air time.
 
-    `header_bytes` of a list and `object_bytes` of each object in it (as simulations of cooperative perception have
-    taken them; not checked against a standard).
+    A list has `header_bytes`, and `object_bytes` for each object (values used in simulations of cooperative perception;
+    not checked against a standard).
     """
 
     kbps: Positive
@@ -43,9 +43,9 @@ class Channel(Frozen):
 
 
 class Radio(LinkModel):
-    """A link by radio: `latency`, and whether a list arrives (`reception`); `memory` says what of the draws lasts.
+    """A radio link: `latency`, and the probability that a list arrives (`reception`); `memory`: which draws last.
 
-    `order: kept`: no list arrives before an older one of its unit that is sent. `channel`: lists queue at their unit.
+    `order: kept`: no list arrives before an older one that its unit sent. `channel`: lists queue at their unit.
     """
 
     kind: Literal["radio"] = "radio"

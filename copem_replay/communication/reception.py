@@ -81,7 +81,7 @@ def probability_of(model: ReceptionModel, path: RadioPath, noise: Noise, where: 
 
 
 class ConstantReception(ReceptionModel):
-    """One probability, wherever the sender is."""
+    """The same probability, wherever the sender is."""
 
     by_path: ClassVar[bool] = False
 
@@ -124,11 +124,11 @@ class TableReception(ReceptionModel):
 
 
 class Shadowing(ReceptionModel):
-    """Path loss by distance, and log-normal shadowing: Φ((10 n lg(d₅₀ / d) − b) / σ), b where the way is blocked.
+    """Path loss by distance, and log-normal shadowing: Φ((10 n lg(d₅₀ / d) − b) / σ); b is 0 if the path is free.
 
     Source: eq. (13) of Sepulcre et al., "Analytical models of the performance of IEEE 802.11p vehicle to vehicle
-    communications", IEEE Trans. Veh. Technol. 71 (2022), with the distance at which half arrives in the place of power,
-    sensitivity and the path loss of a metre.
+    communications", IEEE Trans. Veh. Technol. 71 (2022), with the distance at which half of the lists arrive instead of
+    power, sensitivity and the path loss of a metre.
     """
 
     kind: Literal["shadowing"] = "shadowing"
@@ -149,10 +149,10 @@ class Shadowing(ReceptionModel):
 
 
 class GilbertElliott(ReceptionModel):
-    """Two states, good and bad, each with a loss of its own; bad `bad_share` of the time, `bad_lasts_s` on average.
+    """Two states, good and bad, each with its own loss; `bad_share` of the time is bad, for `bad_lasts_s` on average.
 
-    Source: Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39 (1960); Elliott, ibid. 42 (1963). In
-    continuous time, so that it is the same channel at any list rate.
+    Source: Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39 (1960); Elliott, ibid. 42 (1963). It is
+    in continuous time, so the channel is the same at any list rate.
     """
 
     by_path: ClassVar[bool] = False

@@ -27,12 +27,12 @@ _MORE = 1e-6
 
 
 class Sends(Frozen):
-    """What a unit sends of the lists it makes.
+    """Which lists and objects a unit sends.
 
-    `interval_s`: it sends messages not more often than that. `kind: cpm`: an object that is new at once, and again when
-    it moved by more than 4 m, its speed changed by more than 0.5 m/s, its heading by more than 4°, or after 1 s; all
-    vulnerable road users together, when one of them is new or was sent 0.5 s ago. `max_objects` of a message: new ones
-    first, then those of which most is to be told.
+    `interval_s`: shortest time between messages. `kind: cpm`: a new object is sent at once, and again after it has
+    moved by more than 4 m, changed its speed by more than 0.5 m/s, turned by more than 4°, or after 1 s; all vulnerable
+    road users are sent together, when one of them is new or was last sent 0.5 s ago. `max_objects`: the most objects in
+    a message, new ones first, then those that changed most.
     """
 
     kind: Literal["all", "cpm"] = "all"

@@ -27,9 +27,9 @@ class Part(Frozen):
     """A part of a quantity's draws that lasts.
 
     `share`: of the variance where normals are drawn (errors), of the lists where uniforms are (detection).
-    `correlation_s`: how long. `of`: the rows that share the number: one unit and object, all objects of a unit, all
-    units of an object, all rows. `path`: whether it is `held` and then another, or `drifts`; left out, uniforms are
-    held and normals drift.
+    `correlation_s`: the time in which the correlation decays to 1/e. `of`: what shares the number: one unit and object
+    (`pair`), all objects of a unit, all units of an object, or everything. `path`: the number is `held` and then
+    replaced, or it `drifts`; by default uniforms are held and normals drift.
     """
 
     share: Share

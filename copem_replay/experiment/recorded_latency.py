@@ -25,9 +25,9 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class RecordedLatency(LatencyModel):
-    """Latencies as they were recorded: of `column` of a CSV, in seconds, or log time − `stamp` of an MCAP's `topic`.
+    """Recorded latencies: `column` of a CSV, in seconds, or log time − `stamp` of the messages on an MCAP's `topic`.
 
-    `file` is relative to the experiment file. Between the values quantiles are linear.
+    `file` is relative to the experiment file. Quantiles are interpolated linearly between the values.
     """
 
     kind: Literal["recorded"] = "recorded"

@@ -60,10 +60,10 @@ _NOT_RECORDED = {
 
 
 class Unit(Placement):
-    """A perception unit: its place, and the PEM its lists come from, or the topic they are `recorded` on.
+    """A perception unit: its place, and the PEM or the `recorded` topic of its lists.
 
-    One whose lists are recorded has no PEM, and needs a place only where distances are measured from it. `ready`: how
-    long after its capture a list is there to be sent; `sends`: which lists, and what of them.
+    A recorded unit has no PEM, and needs a place only where distances are measured from it. `ready`: processing time
+    from capture until a list can be sent; `sends`: which lists and objects it sends.
 
     >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
     True
@@ -98,12 +98,12 @@ class Unit(Placement):
 
 
 class Configuration(Frozen):
-    """What is compared: which units, which fusion, which `link` and on top which latency, by unit or not.
+    """Units, fusion, `link` and additional latency (for all units or by unit) that are compared with others.
 
     `issue_hz`: how often the receiver issues fused lists; left out, whenever a list arrives.
 
-    Or a stack's `recorded` output, and the recorded units it had as `inputs`: ideal fusion of these is what its regret
-    is to.
+    Or a stack's `recorded` output, and the recorded units that were its `inputs`: its regret is the difference to ideal
+    fusion of these.
 
     >>> late = cr.Configuration(units="all", latency_s={"ego": 0.0, "default": 0.15}, fusion={"kind": "gnn"})
     >>> late.latency_of("mast"), late.fusion.kind
@@ -151,11 +151,11 @@ MEASURED_PER_LOG = ("objects", "onset", "distance_to", "annotated")
 
 
 class LogSettings(Frozen):
-    """A recording, and what is otherwise for it: keys that are given replace those of the experiment, lists whole.
+    """A recording and its settings: keys given here replace those of the experiment, lists as a whole.
 
-    `file`: as a plain entry, wildcards too. `name`: what the log is called, by default as its file. Of `units` and
-    `measure` single keys are replaced; `null` in the place of a unit: the log lacks it. `together`, in the place of
-    `file`: several recordings of one drive; `clock_offset_s`: how far the clock of one is ahead of the first one's.
+    `file`: a path, wildcards allowed. `name`: name of the log, by default that of its file. In `units` and `measure`
+    single keys are replaced; a unit that is `null` is absent from the log. `together`, instead of `file`: several
+    recordings of one drive; `clock_offset_s`: how far the clock of each is ahead of the first one's.
     """
 
     file: Annotated[str, Field(min_length=1)] | None = None
@@ -240,8 +240,8 @@ def _as_file(schema: dict[str, Any]) -> None:
 class Experiment(Frozen):
     """An experiment file.
 
-    `logs`: paths or URLs, or mappings with what is otherwise for a log. `window_s`: what of each log is read, [from,
-    to] in seconds since the first message of its truth was logged.
+    `logs`: paths or URLs, or mappings with settings for one log. `window_s`: the part of each log that is read,
+    [from, to] in log time since the first message of its truth.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed

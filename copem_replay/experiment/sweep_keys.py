@@ -40,7 +40,7 @@ SweptNames = Annotated[tuple[Id, ...], Field(min_length=1)]
 
 
 class SweptBy(Frozen):
-    """Which configurations each quantity changes, where not all change the same ones."""
+    """Which configurations each quantity changes, if these differ between quantities."""
 
     latency_s: SweptNames | None = None
     rate_hz: SweptNames | None = None
@@ -56,15 +56,14 @@ Swept = Either[SweptNames, SweptBy]
 
 
 class Sweep(Frozen):
-    """Values of one quantity at a time at which `configurations` are run, too: names, or names by quantity.
+    """Further values at which `configurations` (names, or names by quantity) are run, one quantity at a time.
 
-    By default they are all that a quantity changes, of the latency those that state one above 0 or by unit.
-    `latency_s`: of the whole list; where latencies are given by unit, the `default` one. `rate_hz`: of every unit.
-    `units`: how many of a configuration's units beside the ego's, the first ones. `penetration_rate`:
-    how many of those that may carry a unit do. `correlation_s`: of the first part of `memory.detection`; 0: new in
-    every list. `ghosts_in_list`: how many of the first entry of `ghosts` there are in a list, on average. `loss`: the
-    share of lists that links lose; `burst_s`: how long losses last, `bad_lasts_s` or else the first part of
-    `memory.reception`.
+    By default a quantity changes all configurations that have it; `latency_s` those with a latency above 0 or by unit.
+    `latency_s`: of the whole list; if latencies are by unit, the `default` one. `rate_hz`: of every unit. `units`:
+    number of a configuration's units beside the ego's, taken in order. `penetration_rate`: share of possible carriers
+    with a unit. `correlation_s`: of the first part of `memory.detection`; 0: new in every list. `ghosts_in_list`: mean
+    number of ghosts of the first entry of `ghosts` in a list. `loss`: share of lists that links lose. `burst_s`: how
+    long losses last: `bad_lasts_s`, else the first part of `memory.reception`.
     """
 
     configurations: Swept | None = None

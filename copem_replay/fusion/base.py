@@ -23,8 +23,8 @@ class Fusion(Component, ABC):
 class Ideal(Fusion):
     """The paper's Ideal Fusion Model: matching by truth id, inverse-variance combination (fusion/ideal.py).
 
-    `combine: samples` weighs the units' sampled errors (draws stay common with other configurations),
-    `combine: posterior` draws once from N(μ, Σ); both have the same law.
+    `combine: samples` weighs the units' sampled errors (with random numbers common to all configurations), `combine:
+    posterior` draws once from N(μ, Σ); both have the same distribution.
     """
 
     kind: Literal["ideal"] = "ideal"

@@ -37,22 +37,23 @@ class Gnn(ListFusion):
 
     List after list, newest capture first, the entries are assigned to the clusters so far at least total cost d² +
     ln|S|, S = P_cluster + P_entry, where d² = νᵀS⁻¹ν is within `gate` (the share of true pairs inside: χ², two degrees
-    of freedom) and the classes agree; an entry that is left founds a cluster. No unit is twice in one. The members'
-    positions are combined by `combine`: inverse variance (independent errors) or covariance intersection (any
-    correlation; of least trace or, `minimise`, determinant), in closed form if fast, which gives the best member where
-    that is better; inverse covariance intersection (common information, counted once); split covariance intersection (a
-    part of each stated covariance, `dependent_share`, or `dependent_m2` per axis, hangs together in whatever way, the
-    rest is independent); cross covariance (every two errors are correlated by `correlation`); covariance union (inverse
-    variance, but clusters whose classes agree and whose boxes overlap, no list having both, are one object in conflict:
-    what lies beyond `conflict_gate` of the others is united with them, so that whichever is right is covered).
-    Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height, velocity, size and yaw (on the circle) the
-    mean by inverse trace of the position covariance. Source: S. Blackman, R. Popoli, "Design and Analysis of Modern
-    Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py and the files beside it, and for the
-    running state by which clusters that do not count all as independent are compared W. Niehsen, "Information fusion
-    based on fast covariance intersection filtering", FUSION 2002. Assumes Gaussian position errors of the stated
-    covariance without bias, and lists of about one instant. A stale list of a moving object, a biased unit or too small
-    a covariance leaves it as a duplicate; objects closer than the gate may swap or merge members; units that repeat
-    each other are counted as often as they speak by inverse variance; existence always is.
+    of freedom) and the classes agree; an entry that is left founds a cluster. A cluster has at most one entry of a
+    unit. The members' positions are combined by `combine`: inverse variance (independent errors) or covariance
+    intersection (any correlation; of least trace or, `minimise`, determinant), in closed form if fast, which gives the
+    best member where that is better; inverse covariance intersection (common information, counted once); split
+    covariance intersection (a part of each stated covariance, `dependent_share`, or `dependent_m2` per axis, is
+    correlated in any way, the rest is independent); cross covariance (every two errors are correlated by
+    `correlation`); covariance union (inverse variance, but clusters whose classes agree and whose boxes overlap, no
+    list having both, are one object in conflict: members beyond `conflict_gate` of the others are united with them, so
+    that the result covers whichever is right). Existence is 1 − Π(1 − pₙ), class probabilities are the mean; height,
+    velocity, size and yaw (on the circle) the mean by inverse trace of the position covariance. Source: S. Blackman, R.
+    Popoli, "Design and Analysis of Modern Tracking Systems", 1999 (assignment, its cost and gate); fusion/covariance.py
+    and the files beside it, and for the running state by which clusters that do not count all as independent are
+    compared W. Niehsen, "Information fusion based on fast covariance intersection filtering", FUSION 2002. Assumes
+    Gaussian position errors of the stated covariance without bias, and lists of about one instant. A stale list of a
+    moving object, a biased unit or too small a covariance leaves it as a duplicate; objects closer than the gate may
+    swap or merge members; inverse variance counts repeated information as often as units state it; existence always
+    does.
     """
 
     kind: Literal["gnn"] = "gnn"

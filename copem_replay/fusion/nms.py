@@ -22,14 +22,14 @@ from copem_replay.fusion.union import run_after_run, side_by_side
 class Nms(ListFusion):
     """Greedy non-maximum suppression over every unit's newest list, the usual late fusion of cooperative detection.
 
-    Entries claimed less likely than `min_existence` are left out. Of the others the most likely come first (of equals
+    Entries with an existence below `min_existence` are left out. The others are taken by falling existence (of equals
     the smaller trace of covariance, then the newer capture, then x and y), and each is kept unless its class agrees
     with that of one kept already and the two overlap: their boxes by more than `iou` (intersection over union), or,
-    `by: centre`, their centres are within `radius_m`. What is kept is one unit's word, unchanged. Source: R. Xu et
-    al., "OPV2V", ICRA 2022, whose settings the thresholds of existence and overlap are; the radius is chosen. Assumes
-    that the most confident unit is the most accurate one and that boxes of one object overlap. Position errors of the
-    order of the box (pedestrians; stale lists; entries without a size) leave duplicates, objects closer than the
-    threshold suppress each other, and where all units claim certainty the smallest stated covariance decides.
+    `by: centre`, their centres are within `radius_m`. Entries that are kept are unchanged. Source: R. Xu et al.,
+    "OPV2V", ICRA 2022, which has these thresholds of existence and overlap; the radius is chosen. Assumes that the most
+    confident unit is the most accurate one and that boxes of one object overlap. Position errors of the order of the
+    box (pedestrians; stale lists; entries without a size) leave duplicates, objects closer than the threshold suppress
+    each other, and where all units claim certainty the smallest stated covariance decides.
     """
 
     kind: Literal["nms"] = "nms"

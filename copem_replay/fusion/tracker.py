@@ -26,31 +26,30 @@ _LATE = {"stale": STALE, "predict": PREDICT, "replay": REPLAY}
 
 
 class Tracker(ListFusion):
-    """Keeps a constant-velocity Kalman filter per object, fed by every list that arrives, the late ones too.
+    """A constant-velocity Kalman filter per object, updated by every list that arrives, late ones included.
 
     List after list, entries are assigned to tracks at least total cost d² + ln|S|, S = P + R, where d² is within `gate`
     (the share of true pairs inside: χ², two degrees of freedom) and the classes agree; an entry that is left founds a
-    track of the entry's own velocity ± `speed_sigma_mps` per axis. Velocities are not measured after that. `late` says
-    what becomes of a list that shows the past: `stale`, it is taken for the present unless a newer one of its unit is
-    there; `predict`, its entries are moved to now by their own velocities, R growing by q·age³/3; `replay`, it is heard
-    at its capture, and everything captured since again: the same as if it had been in time, up to `buffer_s` back,
-    beyond which it is ignored. What a unit last claimed of a track fades with `forget_s`, existence is 1 − Π(1 −
-    cₙe^(−age/forget)), so that it depends on time and not on the rate of lists; where it is not above `drop` a track
-    ends. Ages count from capture (`stale`: from when the list was heard, as if of then), and what a unit captured last
-    is its last word, in whatever order lists come; of units whose messages leave objects out claims fade only after the
-    receiver's `max_age_s`. A track is published above `publish`, when the captures that support it span `confirm_s`. Of
-    two tracks as close as two entries of one object may be (d² within the median of χ²), which no list held both for
-    `forget_s`, the younger ends. Yaw and height above ground are the newest entry's, size and class probabilities the
-    mean of all. `errors_last_s` τ: the position errors of one unit about one object decay as e^(−Δ/τ), so an entry
-    counts as a fresh one of R·(1 + φ)/(1 − φ), φ = e^(−Δ/τ) of the time since that unit's last about the track; the
-    first counts fully, and an object at rest gets the variance of the best linear estimate. `common_share`: so much of
-    each R may hang together with anything, and does not shrink (split covariance intersection); `errors_last_s` then
-    tells of the rest. Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
-    Navigation", 2001. Assumes white acceleration of density q = `acceleration_psd_m2ps3`, Gaussian position errors of
-    the stated covariance, independent between lists and units where these two do not say otherwise, without bias. A
-    turning or braking object lags behind, its track too sure of itself; a biased unit, or one whose errors persist,
-    splits objects or pulls them along; an object not listed beside its neighbour can be taken for it as long as it is
-    within the gate.
+    track with its own velocity ± `speed_sigma_mps` per axis. Later velocities are not used. `late` says how a list that
+    shows the past is used: `stale`, as if it showed the present, unless a newer one of its unit is there; `predict`,
+    its entries are moved to now by their own velocities, R growing by q·age³/3; `replay`, it is processed at its
+    capture, and all later captures again, with the same result as if it had come in time; a list older than `buffer_s`
+    is ignored. A unit's last claimed existence of a track fades with `forget_s`, existence is 1 − Π(1 −
+    cₙe^(−age/forget)), so that it depends on time and not on the rate of lists; a track ends when it is not above
+    `drop`. Ages count from capture (`stale`: from arrival), and a unit's last claim is the one captured last, in
+    whatever order lists come. Claims of units with partial messages fade only after the receiver's `max_age_s`. A track
+    is published above `publish`, when the captures that support it span `confirm_s`. Of two tracks as close as two
+    entries of one object may be (d² within the median of χ²), which no list held both for `forget_s`, the younger ends.
+    Yaw and height above ground are the newest entry's, size and class probabilities the mean of all. `errors_last_s` τ:
+    the position errors of one unit about one object decay as e^(−Δ/τ), so an entry counts as a fresh one of R·(1 +
+    φ)/(1 − φ), φ = e^(−Δ/τ) of the time since that unit's last about the track; the first counts fully, and an object
+    at rest gets the variance of the best linear estimate. `common_share`: this share of each R may be correlated with
+    anything, and does not shrink (split covariance intersection); `errors_last_s` then applies to the rest. Source: Y.
+    Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001. Assumes white
+    acceleration of density q = `acceleration_psd_m2ps3`, Gaussian position errors of the stated covariance, independent
+    between lists and units where these two do not say otherwise, without bias. A turning or braking object lags behind,
+    its track too sure of itself; a biased unit, or one whose errors persist, splits objects or pulls them along; an
+    object not listed beside its neighbour can be taken for it as long as it is within the gate.
     """
 
     kind: Literal["tracker"] = "tracker"

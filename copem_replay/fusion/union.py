@@ -18,10 +18,11 @@ _APART, _LARGEST = np.int64(-7046029254386353131), np.int64(2**63 - 1)
 
 
 class Union(ListFusion):
-    """All entries of every unit's newest list side by side, as they are; those claimed less likely than
-    `min_existence` are left out. No source: it is what cooperative perception is before any fusion. It assumes
-    nothing, and so an object listed by n units is there n times, n − 1 times as a duplicate, and every ghost stays.
-    Tracks of different units are different ones; those of the first unit keep their ids.
+    """All entries of every unit's newest list side by side, unchanged.
+
+    Entries with an existence below `min_existence` are left out. No source: it is cooperative perception without any
+    fusion. It assumes nothing, so an object listed by n units is there n times, n − 1 times as a duplicate, and every
+    ghost stays. Tracks of different units get different ids; those of the first unit keep theirs.
     """
 
     kind: Literal["union"] = "union"

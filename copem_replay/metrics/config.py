@@ -31,11 +31,11 @@ def _only(self: BaseModel, *names: str) -> None:
 
 
 class Within(Frozen):
-    """Which objects matter, by the truth: in a polygon or near the ego's way at their onset, or soon on that way.
+    """Which objects matter, by the truth: in a polygon or near the ego's path at their onset, or soon on that path.
 
-    `corridor_m`: at most so far from the way that the ego's centre takes from the onset to the end of the episode.
-    `conflict_s`: at any instant until the end of its episode the object, keeping its velocity, would within so long be
-    where the ego, keeping its speed, will sweep its way, and the margin of `measure.conflict` around it.
+    `corridor_m`: largest distance from the path of the ego's centre from the onset to the end of the episode.
+    `conflict_s`: at some instant of its episode the object, at constant velocity, would within this time enter the area
+    that the ego, at constant speed, sweeps along its path, with the margin of `measure.conflict` around it.
     """
 
     polygon_m: Polygon | None = None
@@ -56,7 +56,7 @@ class Within(Frozen):
 
 
 class AnnotatedArea(Frozen):
-    """Where the truth holds all there is: a polygon, or so far around the place that distances are measured from."""
+    """Where the truth has all objects: a polygon, or a range around the place that distances are measured from."""
 
     polygon_m: Polygon | None = None
     range_m: Positive | None = None
@@ -70,7 +70,7 @@ class AnnotatedArea(Frozen):
 
 
 class Objects(Frozen):
-    """Which objects are measured. No key: all moving objects but the ego. `within`: of these only what matters."""
+    """Which objects are measured: by default all that move but the ego. `within`: of these only those that matter."""
 
     classes: ClassNames | None = None
     ids: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
@@ -119,10 +119,10 @@ Margin = Annotated[float, Field(strict=True, ge=0, le=100)]
 
 
 class Conflict(Frozen):
-    """When a perceived state implies a collision: its predicted way meets the ego's corridor within the horizon.
+    """When a perceived state implies a collision: its predicted path meets the ego's corridor within the horizon.
 
-    The corridor is what the ego, at its present speed, will sweep of its own path, and `margin_m` around it; the object
-    is taken to keep its perceived velocity.
+    The corridor is the area that the ego sweeps along its path at its present speed, with `margin_m` around it. The
+    object is predicted with constant perceived velocity.
     """
 
     horizon_s: Positive = 3.0
@@ -130,7 +130,7 @@ class Conflict(Frozen):
 
 
 class Match(Frozen):
-    """How entries of fused lists are matched to true objects; `always`: those of ideal fusion and the truth, too."""
+    """How entries of fused lists are matched to true objects; `always`: also those of ideal fusion and of the truth."""
 
     gate_m: Positive = 3.0
     always: Flag = False
@@ -144,10 +144,10 @@ class Gospa(Frozen):
 
 
 class Measure(Frozen):
-    """What is measured, and from when. `accuracy`: how far off the fused lists are, beside when they hold an object.
+    """What is measured, and from which onset. `accuracy`: also measure how far off the fused lists are.
 
-    `annotated`: where entries at no true object are ghosts, by default everywhere. `metrics`: own columns of the
-    summary.
+    `annotated`: the area in which entries at no true object are ghosts, by default everywhere. `metrics`: your own
+    columns of the summary.
 
     >>> measure = cr.Measure(objects={"classes": ["vru"]}, onset={"kind": "in_range", "range_m": 30.0})
     >>> measure.onset.range_m, measure.confirm.hits
@@ -182,7 +182,7 @@ class Measure(Frozen):
 
 
 class Braking(Frozen):
-    """What the ego's declared driver does when an object is known (`brakes_for: object`) or seen to be in its way.
+    """What the ego's driver does when an object is known (`brakes_for: object`) or a list implies a collision.
 
     `ego`: until it brakes, the ego drives as recorded, or with constant speed from the onset (the recorded driver may
     have braked already).

@@ -1,4 +1,4 @@
-"""Lists under way: columns of configurations that name a link, and of no others."""
+"""What happens to lists on links, for configurations that name one."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ def _share(part: int, whole: int) -> float | None:
 _row = partial(Metric, statistics=_times, better=-1, part="link")
 LINK = (
     _row("lost_share", value=lambda of: _share(of.lost, of.sent),
-         help="share of the lists that a link loses, of those that units send by one"),
+         help="share of the lists sent by a link that it loses"),
     _row("age_of_information_p50_s", value=lambda of: of.age_s(0.5),
-         help="how old the newest list of a unit that has arrived by a link is, half of the time; from its capture"),
-    _row("age_of_information_p95_s", value=lambda of: of.age_s(0.95), help="and 95 % of the time"),
+         help="age since capture of a unit's newest list that arrived by a link: at most this for 50 % of the time"),
+    _row("age_of_information_p95_s", value=lambda of: of.age_s(0.95), help="the same for 95 % of the time"),
     _row("overtaken_share", value=lambda of: _share(of.overtaken, of.sent - of.lost),
-         help="share of the lists that arrive after a newer one of their unit, of those that arrive; trackers still "
-              "hear them, and all fusions where messages are partial"),
+         help="share of the arriving lists that come after a newer one of their unit; trackers still use them, and "
+              "all fusions do where messages are partial"),
 )  # fmt: skip
 """Columns of `summary.csv` where a configuration has a link."""

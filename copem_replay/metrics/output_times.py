@@ -36,10 +36,10 @@ def _mean(total_s: float, lists: int) -> float | None:
 
 OUTPUT = (
     Metric("output_latency_s", _times, lambda of: _mean(of.latency_s, of.with_latency), -1,
-           "a stack's lists: available − the stamp of the state, mean; a dash: the messages don't say", "output"),
+           "a stack's lists: available − the stamp of the state, mean; a dash: not in the messages", "output"),
     Metric("output_delay_s", _times, lambda of: _mean(of.delay_s, of.with_delay), -1,
-           "how long before its stamp the state was so, by `delay_s` of the experiment", "output"),
+           "a stack's lists: that stamp − the instant of the state, by `delay_s` of the experiment", "output"),
     Metric("input_age_s", _times, lambda of: _mean(of.input_age_s, of.with_input), -1,
-           "available − the newest capture of an input that had arrived; no latency", "output"),
+           "available − the newest capture of an input that had arrived: its age, not a latency", "output"),
 )  # fmt: skip
 """Columns of `summary.csv` where a configuration is recorded."""

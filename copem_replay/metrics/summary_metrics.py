@@ -235,13 +235,17 @@ def _limits(of: str, statistics: Callable[[Given], Share | None], prefix: str = 
     return (
         row(f"{of}_low", value=attrgetter("low"), help=f"lower limit of {of}, 95 %"),
         row(f"{of}_high", value=attrgetter("high"), help=f"upper limit of {of}, 95 %"),
-        row(f"{prefix}interval", value=attrgetter("kind"), help=f"of which kind the limits of {of} are"),
-        row(f"{prefix}interval_over", value=attrgetter("over"), help=f"what is resampled for the limits of {of}"),
+        row(f"{prefix}interval", value=attrgetter("kind"), help=f"kind of the limits of {of}, or why there are none"),
+        row(
+            f"{prefix}interval_over",
+            value=attrgetter("over"),
+            help=f"what the limits of {of} are over: runs, objects or logs",
+        ),
     )
 
 
-_DISTANCE = "distance at detection, centre to centre: half were farther away; never detected ranks below every distance"
-_PASSES = "of those, how many the declared driver, braking when it knew, stays clear of, [95 % interval]"
+_DISTANCE = "median distance at detection, centre to centre; never detected ranks below all"
+_PASSES = "share of conflicts that the configured driver avoids when braking after detection, [95 % interval]"
 
 _DETECTION_METRICS = (
     Metric("n", _itself, lambda of: int(of.rows["runs"].sum()), 0, "rows: runs × measured objects × logs", "summary"),
@@ -249,41 +253,45 @@ _DETECTION_METRICS = (
     Metric("detected_share", detected, lambda of: of.share, 1,
            "share of the rows that were detected, [95 % interval]", "summary", "share detected"),
     *_limits("detected_share", detected),
-    Metric("ttd_p5_s", detections, lambda of: of.quantile_s(0.05), -1, "time by which 5 % were detected"),
+    Metric("ttd_p5_s", detections, lambda of: of.quantile_s(0.05), -1,
+           "time to detection by which 5 % of the rows were detected"),
     Metric("ttd_median_s", detections, lambda of: of.quantile_s(0.5), -1,
-           "time to detection: by then half were detected", "summary"),
+           "median time to detection", "summary"),
     Metric("ttd_p95_s", detections, lambda of: of.quantile_s(0.95), -1,
-           "by then 95 % were; a dash: that many never were", "summary"),
+           "time to detection by which 95 % were detected; a dash: fewer were ever detected", "summary"),
     Metric("ttd_rmst_s", detections, lambda of: of.mean_s(), -1,
            "mean time to detection, never detected counting as the horizon", "summary",
            "mean time to detection, never detected counting as the horizon"),
     Metric("ttd_rmst_horizon_s", detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
     Metric("dad_median_m", detections, lambda of: of.distance_quantile_m(0.5), 1, _DISTANCE, "summary",
            "median of the differences of distances at detection"),
-    Metric("dad_p5_m", detections, lambda of: of.distance_quantile_m(0.05), 1, "95 % were farther away", "summary"),
+    Metric("dad_p5_m", detections, lambda of: of.distance_quantile_m(0.05), 1,
+           "distance at detection that 95 % of the rows exceed", "summary"),
 )  # fmt: skip
 
 _CONFLICT_METRICS = (
     Metric("conflict_detected_share", foreseen, _number, 1,
            "share of the rows in which a list implied a collision", "conflict"),
-    Metric("conflict_ttd_median_s", conflicts, lambda of: of.quantile_s(0.5), -1, "by then half had one", "conflict"),
-    Metric("conflict_ttd_p95_s", conflicts, lambda of: of.quantile_s(0.95), -1, "by then 95 % had", "conflict"),
+    Metric("conflict_ttd_median_s", conflicts, lambda of: of.quantile_s(0.5), -1,
+           "median time to the first list that implied a collision", "conflict"),
+    Metric("conflict_ttd_p95_s", conflicts, lambda of: of.quantile_s(0.95), -1,
+           "time by which 95 % of the rows had such a list", "conflict"),
     Metric("conflict_ttd_rmst_s", conflicts, lambda of: of.mean_s(), -1,
-           "mean time, never counting as the horizon", "conflict"),
+           "mean time to such a list, never counting as the horizon", "conflict"),
     Metric("conflict_dad_median_m", conflicts, lambda of: of.distance_quantile_m(0.5), 1,
-           "distance then: half were farther away", "conflict"),
+           "median distance at such a list", "conflict"),
 )  # fmt: skip
 
 _BRAKING_METRICS = (
     Metric("n_conflict", passed, lambda of: of.n, 0,
-           "rows in which the ego, not braking, would come too near", "braking"),
-    Metric("pass_share", passed, lambda of: of.share, 1, _PASSES, "braking", "share that passes, of those in conflict"),
+           "rows in conflict: without braking the ego would come too near", "braking"),
+    Metric("pass_share", passed, lambda of: of.share, 1, _PASSES, "braking", "share of conflicts that pass"),
     *_limits("pass_share", passed, "pass_"),
 )  # fmt: skip
 
 
 def _exact_metric(name: str, value: Callable[[Exact], float | None], better: Literal[-1, 0, 1]) -> Metric:
-    return Metric(f"{name}_exact", exact, value, better, f"what {name} of the runs tends to")
+    return Metric(f"{name}_exact", exact, value, better, f"{name} in closed form, the limit for many runs")
 
 
 def _exact_missed(name: str, help: str) -> Metric:
@@ -301,9 +309,13 @@ _EXACT_METRICS = (
     _exact_metric("dad_p5_m", lambda of: of.times.distance_quantile_m(0.05), 1),
     _exact_missed("miss_log10", "log₁₀ of the mean probability that an episode misses its object"),
     _exact_missed("miss_log10_half_odds", "the same with the odds of every detection halved"),
-    _exact_missed("miss_per_logit", "d ln of that probability by the log-odds of every detection"),
-    Metric("pass_share_exact", judged, itemgetter(0), 1, "pass_share without a draw", "braking"),
-    Metric("fail_share_exact", judged, itemgetter(1), -1, "share that fails, without a draw; null below 10⁻¹⁵"),
+    _exact_missed("miss_per_logit", "derivative of ln of that probability by the log-odds of every detection"),
+    Metric(
+        "pass_share_exact", judged, itemgetter(0), 1, "pass_share in closed form, the limit for many runs", "braking"
+    ),
+    Metric(
+        "fail_share_exact", judged, itemgetter(1), -1, "share of conflicts that fail, in closed form; null below 10⁻¹⁵"
+    ),
 )
 
 METRICS: tuple[Metric, ...] = (
@@ -315,10 +327,10 @@ METRIC: dict[str, Metric] = {metric.name: metric for metric in METRICS}
 PARTS = {
     "summary": "When, and how far away",
     "braking": "Braking in time",
-    "conflict": "When the collision was foreseen",
+    "conflict": "When a collision was foreseen",
     "accuracy": "How far off",
-    "lists": "What the lists hold",
-    "link": "What links make of lists",
+    "lists": "Contents of the lists",
+    "link": "Lists on links",
     "output": "How old a recorded output is",
     "own": "Own metrics",
 }

@@ -27,13 +27,11 @@ def summary_text(summary: pd.DataFrame, width: int | None = None) -> str:
         lines.append(f"ttd_rmst_s: mean time to detection, never detected counting as {cell(float(horizon.iloc[0]))} s")
     if "conflict_detected_share" in summary:
         lines += ["", *_part(summary, "conflict", width)]
-        lines.append("conflict_*: the same of the first list that implies a collision")
+        lines.append("conflict_*: the same for the first list that implies a collision")
     if "pass_share" in summary and summary["n_conflict"].any():
         lines += ["", *_part(summary, "braking", width, "pass_share")]
         lines += intervals_said(summary, "pass_interval")
-        lines.append(
-            "pass_share: of those in conflict, how many the declared driver, braking when it knew, stays clear of"
-        )
+        lines.append("pass_share: share of conflicts that the configured driver avoids when braking after detection")
     if "output_latency_s" in summary:
         lines += ["", *_part(summary[summary["output_delay_s"].notna()], "output", width)]
         lines.append("output_latency_s: available − the stamp of the state; output_delay_s: that stamp − the state")

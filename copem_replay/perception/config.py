@@ -33,9 +33,7 @@ Rate = Annotated[float, Field(strict=True, ge=0.001, le=1000)]
 
 
 class Carriers(Frozen):
-    """Objects that carry a unit each, or not: every one of these classes but the ego, with probability
-    `penetration_rate`.
-    """
+    """Objects of these classes, except the ego, that carry a unit each with probability `penetration_rate`."""
 
     classes: ClassNames
     penetration_rate: Share

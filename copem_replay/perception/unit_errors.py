@@ -14,11 +14,11 @@ from copem_replay.core.memory import Part, Parts
 
 
 class PoseError(Frozen):
-    """How far off a unit's idea of its own place and heading is: of mounting, and of localisation.
+    """Errors of a unit's own position and heading, from mounting or localisation.
 
-    `position_sigma_m` in easting and in northing alike, `yaw_sigma_deg` of the heading. `memory`: the parts of it that
-    last, of the unit, or `of: all` units alike; the rest is new in every list. `stated`: the covariances that the unit
-    states tell of it.
+    `position_sigma_m` applies to easting and to northing, `yaw_sigma_deg` to the heading. `memory`: the parts that
+    last, for the unit, or with `of: all` shared by all units; the rest is new in every list. `stated`: the unit's
+    stated covariances include these errors.
     """
 
     position_sigma_m: NotNegative = 0.0
@@ -40,9 +40,9 @@ class PoseError(Frozen):
 
 
 class Clock(Frozen):
-    """The error of a unit's clock: an offset, and a drift since the log's start. Standard deviations over the runs.
+    """Errors of a unit's clock: offset, and drift since the log's start, as standard deviations over the runs.
 
-    Within a run both are constant. A fusion is told of captures by this clock.
+    Within a run both are constant. A fusion sees captures in this clock.
     """
 
     offset_sigma_s: NotNegative = 0.0
@@ -50,7 +50,7 @@ class Clock(Frozen):
 
 
 class Outages(Frozen):
-    """A unit makes no list `down_share` of the time, for `lasts_s` on average: no list at all, not an empty one."""
+    """Times without lists: `down_share` of the time, each for `lasts_s` on average."""
 
     down_share: Annotated[float, Field(strict=True, ge=0, le=0.999)]
     lasts_s: Annotated[float, Field(strict=True, ge=0.001, le=86_400)]

@@ -99,7 +99,7 @@ class TestWidth:
     def test_info_of_the_samples(self, show: Show, monkeypatch: pytest.MonkeyPatch, width: int) -> None:
         monkeypatch.chdir(ROOT)
         lines = show(width, "info", "logs/tc016d.mcap", "logs/crossing.mcap")
-        assert len(lines) > 40
+        assert len(lines) > 20
         assert max(map(len, lines)) <= width
 
     def test_run_check_compare_and_report(self, show: Show, here: Path, width: int) -> None:
@@ -150,7 +150,7 @@ def test_the_width_is_that_of_the_terminal(here: Path) -> None:
     assert len(lines) > 10
     assert 40 < max(map(len, lines)) <= 50
     piped = subprocess.run(words, capture_output=True, check=True, env=plain | {"COLUMNS": "50"}, text=True).stdout
-    assert max(map(len, piped.splitlines())) > 100
+    assert max(map(len, piped.splitlines())) > 50
 
 
 class TestTables:

@@ -132,7 +132,7 @@ def test_what_is_put_into_the_bags_is_in_the_intervals_of_the_study(monkeypatch:
         assert low_s < true_s < high_s
         assert low_s < found_s < high_s
     assert f"{put_in.CLOCK_AHEAD_S:g} s ahead" in page
-    assert f"tell of {put_in.EGO_DELAY_S:g} s before" in page
+    assert f"the state {put_in.EGO_DELAY_S:g} s before" in page
     assert f"of {put_in.STACK_AGE_S:g} s before" in page
     assert f"takes {put_in.RADIO_S:g} s" in page
     # By hand, in ms: the stack last heard the vehicle (10 Hz) or the unit (8 Hz from 30 ms), and publishes each 100 ms

@@ -139,10 +139,10 @@ def _resolved(build_up_s: float) -> float:
 
 
 class ConstantDeceleration(Driver):
-    """Brakes with `a_max_mps2` to a stop; with `build_up_s` the deceleration grows linearly to it over that time.
+    """Brakes with `a_max_mps2` to a stop; with `build_up_s` the deceleration grows linearly over that time.
 
-    With build-up the jerk is a_max / build_up, as in the careful and competent driver of UN R157, by way of esmini's
-    reading of it (docs/guide/metrics.md).
+    With build-up the jerk is a_max / build_up, as in the careful and competent driver of UN R157 as implemented in
+    esmini (docs/guide/metrics.md).
     """
 
     kind: Literal["constant_deceleration"] = "constant_deceleration"

@@ -33,9 +33,9 @@ Shares = Annotated[dict[OneClass, Share], Field(min_length=1), AfterValidator(_w
 
 
 class Classes(Frozen):
-    """Classes that objects are listed as, by their true class; a class that is left out is always listed as it is.
+    """The listed classes of objects, by true class; a class that is left out is always listed correctly.
 
-    `confidence`: the probability that is stated of the class that is listed; the rest is spread evenly over the others.
+    `confidence`: the stated probability of the listed class; the rest is spread evenly over the others.
     """
 
     confusion: dict[OneClass, Shares] = Field(default_factory=dict)

@@ -47,7 +47,7 @@ ClassNames = Annotated[tuple[ClassName, ...], Field(min_length=1)]
 
 
 class Condition(Frozen):
-    """When a couple applies. All that is given must hold; bounds are included."""
+    """When a couple applies. All given keys must hold; bounds are included."""
 
     range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(ascending)] | None = None
     azimuth_deg: Annotated[tuple[Number, Number], AfterValidator(one_turn)] | None = None
@@ -77,11 +77,11 @@ def _within(value: Float, low: float, high: float) -> Bool:
 
 
 class Couple(Frozen):
-    """(d_c, p_c) under condition c: the paper's element of a PEM. Without `error` the state is exact.
+    """A detection and an error model that apply under a condition. Without `error` the state is exact.
 
-    `existence`: how probable the unit claims it to be that there is an object, of each entry alike (0.9 is chosen), or
-    by its visible share: the more of it is seen, the surer the unit; or drawn of each (`scores`). `memory`: which draws
-    last where this couple applies, in place of the PEM's.
+    `existence`: the probability that there is an object, as the unit claims it: one value for all entries (0.9 is
+    chosen), the visible share, or drawn for each entry (`scores`). `memory`: which draws last where this couple
+    applies, instead of the PEM's memory.
     """
 
     when: Condition = Condition()

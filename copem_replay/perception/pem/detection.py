@@ -47,7 +47,7 @@ class VisibleShare(DetectionModel):
 
 
 class Constant(DetectionModel):
-    """Detected with one probability wherever the condition holds."""
+    """Detected with the same probability wherever the condition holds."""
 
     kind: Literal["constant"] = "constant"
     probability_: Annotated[Share, Field(alias="probability")]

@@ -34,7 +34,7 @@ class GhostPlace(Component, ABC):
 
 
 class InField(GhostPlace):
-    """Anywhere in a field of view, alike by area; it moves with the unit."""
+    """Uniform over the area of a field of view, which moves with the unit."""
 
     kind: Literal["field"] = "field"
     range_m: Annotated[tuple[NotNegative, NotNegative], AfterValidator(ascending)]
@@ -50,7 +50,7 @@ class InField(GhostPlace):
 
 
 class AtPlaces(GhostPlace):
-    """At one of some places of the log's world, a bit beside it each time."""
+    """At one of the given places in the world frame of the log, with a normal spread around it."""
 
     kind: Literal["places"] = "places"
     frame: ClassVar[Frame] = "world"
@@ -67,7 +67,7 @@ class AtPlaces(GhostPlace):
 
 
 class Beside(GhostPlace):
-    """Around objects of some classes that the unit could list, within a distance of their sides."""
+    """Uniform around objects of the given classes that the unit could list, within a distance of their sides."""
 
     kind: Literal["beside"] = "beside"
     frame: ClassVar[Frame] = "object"
@@ -92,11 +92,11 @@ MeanNumber = Annotated[float, Field(strict=True, ge=0, le=1000)]
 
 
 class Ghosts(Frozen):
-    """One sort of ghosts: `in_list` of them in a list on average (Poisson), each for `lasts_s` (exponential).
+    """One sort of ghosts: on average `in_list` of them in a list (Poisson), each for `lasts_s` (exponential).
 
-    Both are the same at any list rate. `lasts_s: 0`: others in every list. `beside`: so many of each such object.
-    `classes`: what they are listed as, pedestrians where nothing is said (chosen: `other` counts as false only where
-    such objects are measured). `existence`: what the unit claims of it, left out: as the couple that applies.
+    Both are the same at any list rate. `lasts_s: 0`: new ghosts in every list. With `beside`, `in_list` counts for each
+    such object. `classes`: the listed classes, by default pedestrian (chosen: `other` counts as false only where such
+    objects are measured). `existence`: the claimed existence, by default that of the couple that applies.
     """
 
     in_list: MeanNumber

@@ -20,10 +20,10 @@ Shape = Annotated[float, Field(strict=True, ge=0.1, le=1000)]
 
 
 class Scores(Frozen):
-    """Beta distributions of what is claimed of `real` objects and of a `ghost`: [a, b], mean a / (a + b).
+    """Beta distributions of the claimed existence of `real` objects and of a `ghost`: [a, b], mean a / (a + b).
 
-    `calibrated`: what is claimed is how probable it is that there is an object, given what was drawn, if beside the
-    ghosts of the PEM there is one real entry in a list; else it is what was drawn.
+    `calibrated: true`: the unit claims the probability that there is an object given the drawn number, for one real
+    entry in a list beside the ghosts of the PEM. `false`: it claims the drawn number.
     """
 
     kind: Literal["scores"] = "scores"

@@ -12,7 +12,7 @@ from copem_replay.core.components import Frozen
 class TrackIds(Frozen):
     """A unit keeps an id of each object, `lasts_s` on average until it switches to a new one (exponential).
 
-    No two objects swap theirs.
+    Objects never swap ids.
     """
 
     lasts_s: Annotated[float, Field(strict=True, ge=0.001, le=86_400)]
