@@ -32,7 +32,7 @@ def against_log(experiment: Experiment, recording: Recording, *, known: bool = F
         yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"
     within = experiment.measure.objects.within
     if not studied and within is not None and within.of_ego:
-        yield ("measure", "objects", "within"), "no ego in this study, whose way it could be; give `polygon_m`"
+        yield ("measure", "objects", "within"), "no ego in this study, and so no path of it; give `polygon_m`"
     for name, unit in experiment.units.items():
         if unit.on == "ego":
             if not studied:
@@ -40,14 +40,14 @@ def against_log(experiment: Experiment, recording: Recording, *, known: bool = F
         elif isinstance(unit.on, Carriers):
             taken = [one for one in scene.object_ids if f"{name}:{one}" in experiment.units]
             if taken:
-                yield ("units", f"{name}:{taken[0]}"), f"that is what {name} is called on object {taken[0]}"
+                yield ("units", f"{name}:{taken[0]}"), f"this is the name of {name} on object {taken[0]}"
         elif unit.on is not None and unit.on not in scene.object_number:
             yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
     onset = experiment.measure.onset
     if onset.requires is not Requires.UNIT_ON_EGO or known:
         return
     if not studied:
-        yield ("measure", "onset"), f"{onset.kind} is the ego's; without an ego use line_of_sight_any"
+        yield ("measure", "onset"), f"{onset.kind} needs an ego; without one use line_of_sight_any"
     elif not none:
         on_ego = ("ego", scene.object_ids[scene.ego_ix])
         if not any(unit.on in on_ego for unit in experiment.units.values()):

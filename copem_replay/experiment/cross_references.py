@@ -114,11 +114,11 @@ def _carried(source: Source, data: dict[str, Any]) -> Iterator[str]:
         if isinstance(hits, int) and hits > 1 and leaves_out:
             yield source.at(
                 ("measure", "confirm"),
-                f"the messages of unit {name!r} leave out objects that are still there, so that a miss is no "
+                f"the messages of unit {name!r} leave out objects that are still there, so a miss is no "
                 "missed capture; confirm with one hit",
             )
         if measure.get("exact") is True and sends is not None:
-            message = f"unit {name!r} sends by rules (`sends`) that go by what it sent before: that has no closed form"
+            message = f"unit {name!r} has `sends` rules that depend on earlier messages, which has no closed form"
             yield source.at(("measure", "exact"), message)
         if not isinstance(unit.get("on"), dict):
             continue
@@ -183,7 +183,7 @@ def _swept_links(source: Source, kind: str, values: object, chosen: Sequence[obj
         reception, memory = link.get("reception"), link.get("memory")
         of = reception.get("kind") if isinstance(reception, dict) else "constant"
         if kind == "loss" and of not in ("constant", "gilbert_elliott"):
-            message = f"links.{name}.reception: the loss of {of} is none to vary; use constant or gilbert_elliott"
+            message = f"links.{name}.reception: {of} has no loss to vary; use constant or gilbert_elliott"
             yield source.at(("sweep", kind), message)
         found |= kind == "loss" or of == "gilbert_elliott" or (isinstance(memory, dict) and "reception" in memory)
         if kind == "loss" and of == "gilbert_elliott" and isinstance(reception, dict):

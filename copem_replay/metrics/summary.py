@@ -93,7 +93,7 @@ def summary_of(
         if len(rows_of) and clusters(rows_of)[0] is None:
             notes.append(
                 f"no interval of the {what} share: fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-                f"{those}, and more runs do not tell about other traffic"
+                f"{those}, and more runs say nothing about other traffic"
             )
     parts, conflicts = _by_configuration(known), _by_configuration(implied)
     exactly = _by_configuration(exact) if exact is not None else {}

@@ -30,13 +30,13 @@ _TOLERANCE_M = 1e-6
 def only_within(scene: Scene, truth: Tracks, found: Episodes, experiment: MetricsSetup) -> tuple[Episodes, Int]:
     """The episodes that `measure.objects.within` keeps, and the objects of the others, (K,) indices.
 
-    Raises ExperimentError where there is no ego whose way it could be.
+    Raises ExperimentError where there is no ego, and so no path.
     """
     asked = experiment.measure.objects.within
     if asked is None:
         return found, np.empty(0, dtype=np.int64)
     if asked.of_ego and scene.ego_ix < 0:
-        raise ExperimentError(f"{scene.log}: measure.objects.within: no ego in this study, whose way it could be")
+        raise ExperimentError(f"{scene.log}: measure.objects.within: no ego in this study, and so no path of it")
     decide = _at_onset if asked.conflict_s is None else _conflicts
     kept = decide(scene, truth, found, experiment)
     return replace(found, **{f.name: getattr(found, f.name)[kept] for f in fields(found)}), found.object_ix[~kept]

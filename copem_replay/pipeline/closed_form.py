@@ -71,7 +71,7 @@ def _check_truth_ids(experiment: Experiment) -> None:
         elif off := [n for n in experiment.units_of(configuration) if experiment.units[n].outages is not None]:
             why = f"unit {off[0]} has outages, in which all objects miss all lists together"
         elif off := [n for n in experiment.units_of(configuration) if experiment.units[n].sends is not None]:
-            why = f"unit {off[0]} sends by rules (`sends`) that go by what it sent before"
+            why = f"unit {off[0]} has `sends` rules that depend on earlier messages"
         else:
             continue
         raise ExperimentError(f"exact: configuration {name}: {why}, which has no closed form; leave `exact` out")

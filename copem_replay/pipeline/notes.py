@@ -103,7 +103,7 @@ def _clocks(experiment: Experiment) -> Iterator[str]:
     for name, configuration in experiment.configurations.items():
         off = [unit for unit in experiment.units_of(configuration) if experiment.units[unit].clock is not None]
         if off and isinstance(configuration.fusion, Ideal):
-            yield f"configuration {name}: ideal fusion goes by true captures and ignores the clock of {', '.join(off)}"
+            yield f"configuration {name}: ideal fusion uses true captures, ignoring clock errors of {', '.join(off)}"
 
 
 def _beside_nobody(replay: Replay, experiment: Experiment) -> Iterator[str]:
@@ -188,7 +188,7 @@ def _idle(replay: Replay, experiment: Experiment, met: Bool) -> Iterator[str]:
         absent = [m for m in members if not replay.placed.poses[m].present.any()]
         unmet = [m for m in members if m not in absent and not modelled[m]]
         for which, what in (
-            (absent, "makes no list, its carrier is never there"),
+            (absent, "makes no list, its carrier is never in the log"),
             (unmet, f"no object ever meets a condition of its PEM {unit.pem!r}"),
         ):
             if which:
@@ -211,7 +211,7 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
         yield f"objects.within: {outside} of {of} with an onset left out, {in_words(asked)}"
     if not len(measured_objects(scene, measure)):
         others = np.arange(len(scene.object_class)) != scene.ego_ix
-        there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["nobody"]
+        there = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["no other object"]
         wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
         beside = " beside the ego" if scene.ego_ix >= 0 else ""
         yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(there)}{beside}"
@@ -224,7 +224,7 @@ def _unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
     if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:
         recorded = experiment.braking.ego == "recorded"
         yield (
-            f"no verdict: the ego, not braking ({'as recorded' if recorded else 'at constant speed'}), stays more than "
-            f"{experiment.braking.margin_m:g} m from all that is measured"
-            + ("; `ego: constant_speed` asks what if the ego had not braked" if recorded else "")
+            f"no verdict: without braking ({'as recorded' if recorded else 'at constant speed'}) the ego stays "
+            f"more than {experiment.braking.margin_m:g} m from all measured objects"
+            + ("; `ego: constant_speed` assumes that it had not braked" if recorded else "")
         )

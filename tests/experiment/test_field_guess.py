@@ -198,7 +198,7 @@ def test_what_is_missing_is_said(tmp_path: Path, call: Call) -> None:  # noqa: F
     assert made.err[0].startswith("log.mcap: no list of true objects")
     lines = made.out.splitlines()
     assert lines[0] == "# /my/things (my.Things) may be a list of objects:"
-    assert "#   # width_m: …   # needed, and not found: a path, or a number that goes for all" in lines
+    assert "#   # width_m: …   # needed, and not found: a path, or one number for all" in lines
     assert all(line.startswith("#") for line in lines)
     (proposal,) = survey(tmp_path / "log.mcap").proposals
     assert (proposal.missing, proposal.truth) == (["width_m"], None)

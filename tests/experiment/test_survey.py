@@ -127,7 +127,7 @@ def test_describe(path):
         "  moving: 1 pedestrian, 1 car",
         "  stationary: 1 other",
         "  ego: 4 (car, 4.50 × 2.00 × 1.50 m), 0.000 – 1.500 s",
-        "  unit rsu: 2 lists, 0 entries, 4.00 Hz (median); says not when captured",
+        "  unit rsu: 2 lists, 0 entries, 4.00 Hz (median); without captures",
         "    delay_s against the truth cannot be told: nothing in them can be followed from list to list",
         "  note: 1 message of nav_msgs/msg/Odometry not read",
         f"experiment: copem-replay init {path} > experiment.yaml",
@@ -200,7 +200,7 @@ def test_no_truth_says_what_there_is(path):
         "  topic  schema                 encoding  messages",
         "  /odom  nav_msgs/msg/Odometry  cdr              1  poses",
         "  rsu    osi3.SensorData        protobuf         2  lists of a unit, for `recorded: {topic: …}`",
-        "unit rsu: 2 lists, 0 entries, 4.00 Hz (median); says not when captured",
+        "unit rsu: 2 lists, 0 entries, 4.00 Hz (median); without captures",
     ]
 
 

@@ -222,7 +222,7 @@ class TestOneLog:
         assert against_logs(tmp_path, text) == [
             "17: measure.distance_to: drive.mcap: `ego: none` needs `distance_to: <unit>` to measure distances from",
             "11: units.ego.on: drive.mcap: no ego in this study to carry the unit",
-            "17: measure.onset: drive.mcap: line_of_sight is the ego's; without an ego use line_of_sight_any",
+            "17: measure.onset: drive.mcap: line_of_sight needs an ego; without one use line_of_sight_any",
         ]
 
     def test_none_with_a_mast(self, tmp_path: Path) -> None:

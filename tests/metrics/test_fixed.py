@@ -89,7 +89,7 @@ def test_why_there_is_none_is_said_once(made: Path) -> None:
     comparison = compare([made], configurations=["hit"], baseline="GT")
     text = comparison_text(comparison)
     assert "+0.5 (nothing drawn)" in text
-    assert "(nothing drawn): every run is the same, so that an interval over runs would tell nothing" in text
+    assert "(nothing drawn): every run is the same, so an interval over runs has no meaning" in text
     assert "[95 %]" not in text
     assert not any(note.startswith("no interval") for note in comparison.notes)
 

@@ -185,7 +185,7 @@ class TestInARun:
         plan = {"ego": "none", "units": units, "configurations": {"PEM": {"units": ["mast"]}}}
         wanted = experiment(**plan, measure=APPEARS | {"objects": {"within": within}, "distance_to": "mast"})
         problems = dict(against_log(wanted, log))
-        assert problems[("measure", "objects", "within")].startswith("no ego in this study, whose way it could be")
+        assert problems[("measure", "objects", "within")].startswith("no ego in this study, and so no path of it")
         with pytest.raises(ExperimentError, match=r"scene: measure\.objects\.within: no ego in this study"):
             prepare(log, wanted)
 

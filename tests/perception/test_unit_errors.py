@@ -173,7 +173,7 @@ class TestClock:
         without = run(experiment(units={"mast": unit()}, configurations={"PEM": {"units": "all"}}), [alone(2.0)])
         assert result.table.equals(without.table)
         assert (
-            "scene: configuration PEM: ideal fusion goes by true captures and ignores the clock of mast" in result.notes
+            "scene: configuration PEM: ideal fusion uses true captures, ignoring clock errors of mast" in result.notes
         )
 
 

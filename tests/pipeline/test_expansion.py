@@ -197,7 +197,7 @@ class TestExpansion:
         mast = {"at": [0, 0], "height_m": 3.0, "pem": "p"}
         wanted = plan({"ego": EGO, "fleet": some(0.5), "fleet:12": mast})
         (found,) = against_log(wanted, street())
-        assert found == (("units", "fleet:12"), "that is what fleet is called on object 12")
+        assert found == (("units", "fleet:12"), "this is the name of fleet on object 12")
         with pytest.raises(ExperimentError, match="fleet:12 is what fleet is called on object 12") as caught:
             prepare(street(), wanted)
         assert len(caught.value.problems) == 1

@@ -378,7 +378,7 @@ def test_sweeps_of_links(kind: str) -> None:
     ("link", "sweep", "said"),
     [
         ({"reception": RADIO["reception"]}, {"loss": [0.1]},
-         "sweep.loss: links.v2x.reception: the loss of shadowing is none to vary; use constant or gilbert_elliott"),
+         "sweep.loss: links.v2x.reception: shadowing has no loss to vary; use constant or gilbert_elliott"),
         ({"reception": {"kind": "gilbert_elliott", "bad_share": 0.1, "bad_lasts_s": 1.0, "bad_loss": 0.6}},
          {"loss": [0.2, 0.8]},
          "sweep.loss[1]: expected between good_loss and bad_loss of v2x (0 … 0.6), found 0.8"),

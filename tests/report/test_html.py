@@ -227,7 +227,7 @@ class TestWords:
             for line in lines
         )
         assert "GT is the ground truth: the upper bound, not ranked." in lines
-        assert any("over runs" in line and "do not tell about other traffic" in line for line in lines)
+        assert any("over runs" in line and "say nothing about other traffic" in line for line in lines)
 
     def test_without_intervals_it_says_so(self, tmp_path: Path) -> None:
         lines = lines_of(replayed(tmp_path, changed()))

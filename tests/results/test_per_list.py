@@ -258,9 +258,9 @@ def test_times_are_at_exactly_so_many_ghosts(tmp_path, per_min, existence, time_
     assert time["baseline_existence"] == 0.0
     assert (time["ghosts_kept_per_min"], time["baseline_ghosts_kept_per_min"]) == (kept, 0)
     assert (time["value"], time["baseline_value"], time["difference"]) == (time_s, 0.5, time_s - 0.5)
-    said = [note for note in comparison.notes if "ghosts per minute only" in note]
+    said = [note for note in comparison.notes if "all its entries make only" in note]
     assert [note for note in said if note.startswith("late")] == (
-        ["late: all its entries make 60 ghosts per minute only: its ttd_rmst_s_equal_ghosts is at that"]
+        ["late: all its entries make only 60 ghosts per minute: its ttd_rmst_s_equal_ghosts is at that rate"]
         if kept < per_min
         else []
     )

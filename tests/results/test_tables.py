@@ -145,11 +145,11 @@ def test_what_the_table_shows_is_said_below(tmp_path):
     assert lines == [
         "differences to ideal, paired by log, object and run; accuracy at instants that both have",
         "[95 %]: bootstrap interval over objects",
-        "detected_share: exact binomial limits where the difference is the same in every cluster, for resamples then "
-        "are all the same, too",
-        "(all alike): the difference is the same in every cluster, or a median in nearly all, so that nothing tells "
-        "how it varies",
-        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that, objects still there at the "
+        "detected_share: exact binomial limits where the difference is the same in every cluster, because all "
+        "resamples are then the same",
+        "(all alike): the difference is the same in every cluster, or a median in nearly all, so how it varies is "
+        "not known",
+        "ttd_rmst_s: mean time to detection up to 10 s, never detected counting as that; objects still there at the "
         "end are censored",
     ]
 

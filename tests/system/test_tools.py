@@ -253,7 +253,7 @@ def test_a_long_recording_is_timed(tmp_path: Path) -> None:
     assert (short["object_states"], longer["object_states"]) == (240, 480)
     assert all(value > 0 for line in (short, longer, slope) for value in line.values())
     written = (tmp_path / "city.yaml").read_text()
-    assert "# Written by `copem-replay init`, to begin with." in written
+    assert "# Written by `copem-replay init`, as a starting point." in written
     assert "\nruns: 2 " in written
 
 

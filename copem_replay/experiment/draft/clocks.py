@@ -42,7 +42,7 @@ class ClockFound:
             return f"cannot be told: {found.untold}"
         said = f"{found.offset_s:.3f} s (95 %: {found.low_s:.3f} … {found.high_s:.3f} s)"
         if found.unbiased:
-            said += ", if no entry is shifted along its way"
+            said += ", assuming no shift along the path"
         if found.drift is not None:
             drift, low, high = (1e6 * value for value in found.drift)
             said += f", drift {drift:.0f} µs/s (95 %: {low:.0f} … {high:.0f})"

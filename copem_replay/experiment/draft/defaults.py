@@ -122,7 +122,7 @@ def _longest(scene: Scene, truth: Tracks) -> tuple[str, str]:
     if not drives.any():
         return "none", "there is no vehicle to be the ego"
     if scene.moving.sum() < 2:
-        return "none", f"as the only one that moves, {scene.object_ids[int(drives.argmax())]} is measured"
+        return "none", f"{scene.object_ids[int(drives.argmax())]}, the only one that moves, is measured"
     best = max(np.flatnonzero(drives), key=lambda k: (moved[k] >= _MOVED_M, last[k] - first[k], moved[k]))
     longest = (
         f"of the vehicles that drive, {scene.object_ids[best]} ({CLASSES[scene.object_class[best]]}) "

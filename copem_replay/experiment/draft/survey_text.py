@@ -99,11 +99,11 @@ def _unit_lines(unit: UnitFound) -> list[str]:
     """The lists of one unit."""
     if unit.problem:
         return [f"unit {unit.topic}: {unit.problem}"]
-    unsaid = [] if unit.covariances_said else ["no covariances"]
-    unsaid += [] if unit.captures_said else ["not when captured"]
+    unsaid = [] if unit.covariances_said else ["covariances"]
+    unsaid += [] if unit.captures_said else ["captures"]
     said = f"{counted(unit.lists, 'list')}, {counted(unit.entries, 'entry', 'entries')}"
     said += f", {unit.rate_hz:.2f} Hz (median)" if unit.rate_hz is not None else ""
-    lines = [f"unit {unit.topic}: {said}" + (f"; says {' and '.join(unsaid)}" if unsaid else "")]
+    lines = [f"unit {unit.topic}: {said}" + (f"; without {' and '.join(unsaid)}" if unsaid else "")]
     if unit.delay is not None:
         lines.append(f"  delay_s against the truth {'' if unit.delay_s is None else 'is '}{unit.delay}")
     return lines + [f"  {line}" for line in unit.oddities]

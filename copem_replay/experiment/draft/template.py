@@ -26,7 +26,7 @@ def commented(survey: Survey) -> str:
     first = ["ego", "roadside"] if ego else ["roadside", "across"]
     lines = [
         f"# Replays {_plain(survey.recording)}, {truth.span_s:.1f} s: {_objects(truth)}.",
-        "# Written by `copem-replay init`, to begin with.",
+        "# Written by `copem-replay init`, as a starting point.",
         "#",
         "#   copem-replay check experiment.yaml",
         "#   copem-replay run experiment.yaml && copem-replay view out/experiment",
@@ -91,7 +91,7 @@ _ON_KEYS = {
     "z_m": "of the centre of the box",
     "vx_mps": "along the axes of the frame; `velocity: object`: along the object",
 }
-_NEEDED = dict.fromkeys(("length_m", "width_m"), "a path, or a number that goes for all")
+_NEEDED = dict.fromkeys(("length_m", "width_m"), "a path, or one number for all")
 
 
 _ONBOARD = [
@@ -195,7 +195,7 @@ def _configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool)
 def _outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[str]) -> Iterator[str]:
     """What a stack made of the lists, by the names of topics: measured like a fusion."""
     for name, unit in outputs:
-        yield "  # By its name a stack's own output, and what it had; else it is a unit like the others"
+        yield "  # By its name a stack's own output, and its inputs; if it is not, use it as a unit"
         yield from (f"  # {_plain(line)}" for line in unit.oddities)
         late = "" if unit.delay is None else f"   # delay_s {_plain(unit.delay)}"
         yield f"  {name}: {{recorded: {_recorded_value(unit)}, inputs: [{', '.join(recorded)}]}}{late}"

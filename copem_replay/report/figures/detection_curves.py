@@ -210,7 +210,7 @@ def _note(
     bands = f"Bands: 95 %, bootstrap over whole {over}, or exact binomial limits where few decide"
     if over is None:
         few = f"fewer than {FEWEST_CLUSTERS}"
-        bands = f"No bands: {few} logs and {few} objects, and more runs do not tell about other traffic"
+        bands = f"No bands: {few} logs and {few} objects, and more runs say nothing about other traffic"
     elif over == NOTHING_DRAWN:
         bands = "No bands: nothing drawn, every run is the same"
     elif len(names) > MOST_BANDS:

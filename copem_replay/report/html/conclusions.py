@@ -259,7 +259,7 @@ def _how_sure(study: Study) -> Iterator[str]:
     if not len(over) and (kind == NOTHING_DRAWN).any():
         yield (
             "There are no intervals: every run is the same, for recorded lists and the ground truth are not drawn. The "
-            "result holds for this one object; additional runs do not tell about other traffic."
+            "result holds for this one object; additional runs say nothing about other traffic."
         )
         return
     if not len(over):

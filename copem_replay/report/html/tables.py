@@ -116,7 +116,7 @@ def _interval(study: Study, part: Part, columns: Iterable[str]) -> list[str]:
     said = []
     for of in (name for name in columns if name in _INTERVALS):
         lines = intervals_said(rows, _INTERVALS[of])
-        none = ["no interval: too few logs and objects; additional runs do not tell about other traffic"]
+        none = ["no interval: too few logs and objects; additional runs say nothing about other traffic"]
         words = [line.replace("95 %: ", "95 % ").replace("no 95 % of", "no 95 % interval of") for line in lines or none]
         said += [_sentence(f"{without_unit(of)}: {line}") for line in words]
     horizon = rows["ttd_rmst_horizon_s"].dropna() if "ttd_rmst_s" in columns else pd.Series(dtype=float)

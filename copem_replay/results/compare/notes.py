@@ -96,12 +96,12 @@ def notes_on_rows(table: pd.DataFrame, asked: float | None) -> Iterator[str]:
         metrics = ", ".join(dict.fromkeys(without["metric"]))
         yield (
             f"no interval of {metrics}: neither {FEWEST_CLUSTERS} logs, nor {FEWEST_CLUSTERS} measured objects, nor "
-            f"{FEWEST_CLUSTERS} runs of a single one; more runs of several do not tell about other traffic"
+            f"{FEWEST_CLUSTERS} runs of a single one; more runs of several say nothing about other traffic"
         )
     ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
     fewer = ghosts[ghosts["ghosts_kept_per_min"] < asked * (1 - 1e-9)] if asked is not None else ghosts[:0]
     for row in fewer.itertuples():
         yield (
-            f"{row.configuration}: all its entries make {row.ghosts_kept_per_min:.4g} ghosts per minute only: its "
-            "ttd_rmst_s_equal_ghosts is at that"
+            f"{row.configuration}: all its entries make only {row.ghosts_kept_per_min:.4g} ghosts per minute: its "
+            "ttd_rmst_s_equal_ghosts is at that rate"
         )

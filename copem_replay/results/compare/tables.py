@@ -117,15 +117,14 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
         yield f"{APART}: the interval excludes 0"
     yield from _on_intervals(overall)
     yield (
-        f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that, "
+        f"ttd_rmst_s: mean time to detection up to {comparison.horizon_s:.4g} s, never detected counting as that; "
         "objects still there at the end are censored"
     )
     if "ttd_rmst_s_equal_ghosts" in shown:
         yield (
-            "ttd_rmst_s_equal_ghosts: that mean as matches tell, of ideal fusion and the truth too, with so many of "
-            f"the least certain entries of each left out that {comparison.false_positives_per_min:.4g} ghosts per "
-            "minute "
-            "remain, stale ones not counted"
+            "ttd_rmst_s_equal_ghosts: the same mean by match (also for ideal fusion and the truth), with the least "
+            f"certain entries of each left out until {comparison.false_positives_per_min:.4g} ghosts per minute "
+            "remain, not counting stale ones"
         )
     for metric, better in METRICS.items():
         of = overall[overall["metric"] == metric]
@@ -152,12 +151,12 @@ def _on_intervals(overall: pd.DataFrame) -> Iterator[str]:
     if "exact" in kinds:
         yield (
             f"{', '.join(kinds['exact'])}: exact binomial limits where the difference is the same in every cluster, "
-            "for resamples then are all the same, too"
+            "because all resamples are then the same"
         )
     if ALL_ALIKE in kinds:
         yield (
-            f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, or a median in nearly all, so that "
-            "nothing tells how it varies"
+            f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, or a median in nearly all, so how "
+            "it varies is not known"
         )
     if NOTHING_DRAWN in kinds:
-        yield f"({_WITHOUT[NOTHING_DRAWN]}): every run is the same, so that an interval over runs would tell nothing"
+        yield f"({_WITHOUT[NOTHING_DRAWN]}): every run is the same, so an interval over runs has no meaning"
