@@ -265,13 +265,13 @@ def _how_sure(study: Study) -> Iterator[str]:
     if not len(over):
         yield (
             f"There are no intervals: there are fewer than {FEWEST_CLUSTERS} logs and fewer than {FEWEST_CLUSTERS} "
-            "measured objects. The result holds for these objects; additional runs of the same traffic do not tell "
+            "measured objects. The result holds for these objects; additional runs of the same traffic say nothing "
             "about other traffic."
         )
         return
     tells = {
-        "runs": "how far other draws of the same models may differ, for this one object in this one log; they do not "
-        "tell about other traffic",
+        "runs": "how far other draws of the same models may differ, for this one object in this one log; they say "
+        "nothing about other traffic",
         "objects": "how far other objects in traffic of this kind may differ",
         "logs": "how far other recordings of this kind may differ",
     }[str(over.iloc[0])]
