@@ -6,6 +6,7 @@ import ast
 import filecmp
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -241,6 +242,13 @@ class TestFusedTracks:
             columns = (found["available_s"].round(6), found["object_id"], found["x_m"].round(6))
             assert sorted(zip(*columns, strict=True)) == sorted(written)
             assert (found["captured_s"] <= found["available_s"] + 1e-9).all()
+
+    def test_exact_states_have_a_covariance_of_0(self, here: Path) -> None:
+        fused = cr.fused_tracks("e.yaml", "drive.mcap")["GT"]
+        exact = replace(fused.fused, cov_ee_m2=None, cov_en_m2=None, cov_nn_m2=None)
+        found = replace(fused, fused=exact).to_dataframe()
+        assert len(found) > 0
+        assert (found[["cov_ee_m2", "cov_en_m2", "cov_nn_m2"]] == 0).all(axis=None)
 
     def test_a_run_beyond_the_experiment(self, here: Path) -> None:
         runs = cr.load_experiment("e.yaml").runs

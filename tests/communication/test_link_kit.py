@@ -71,6 +71,7 @@ class Heard(ReceptionModel):
             "inputs": lambda: path.visible_share,
             "again": lambda: np.random.default_rng().random() * path.visible_share,
             "alone": lambda: path.visible_share / len(path.visible_share),
+            "one": lambda: np.where(path.distance_m < 999, 1.0, np.nan),
         }[self.how]()
 
 
@@ -82,3 +83,8 @@ def test_each_rule_is_checked(how: str) -> None:
     if how != "order":
         with pytest.raises(BrokenLinkRuleError, match=f"^mine breaks the rule '{how}'"):
             check_reception(Heard(kind="mine", how=how))
+
+
+def test_one_number_that_is_none_is_enough() -> None:
+    with pytest.raises(BrokenLinkRuleError, match=r"^mine breaks the rule 'answer'"):
+        check_reception(Heard(kind="mine", how="one"))

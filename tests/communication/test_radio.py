@@ -253,6 +253,18 @@ def test_a_reception_of_the_users_own() -> None:
     assert not (fresh | always)[500:].any()
 
 
+class Early(LatencyModel):
+    """One of a user's own, of whose delays some are below 0."""
+
+    def delays(self, uniform: Float) -> Float:
+        return uniform - 0.5
+
+
+def test_a_latency_of_the_users_own_below_0_is_refused() -> None:
+    with pytest.raises(cr.InputError, match=r"delays.*expected seconds of 0 or more"):
+        radio(latency={"kind": f"{__name__}:Early"}).delays_s(lists(100))
+
+
 @pytest.mark.parametrize(
     ("keys", "said"),
     [

@@ -172,6 +172,9 @@ class TestYaml:
         assert found == []
         assert data == {"key": as_read(value)}
 
+    def test_a_list_goes_on_in_the_next_line_past_110_characters(self) -> None:
+        assert plain_yaml.dump({"a": [10] * 28}) == "a: [" + "10, " * 26 + "10,\n  10]\n"
+
 
 def as_read(value: Any) -> Any:
     """Keys that are numbers are text, whichever way they were written: there is nothing else to expect."""

@@ -720,6 +720,12 @@ def test_passing_is_what_is_judged(case: Case, a_max: float, build_up_s: float, 
     assert (np.abs(near[np.isin(brake_s, off)] - 0.5) < 0.05).all()
 
 
+def test_instants_to_begin_at_without_a_margin() -> None:
+    # 20.012 m of way, of which stopping takes 6.25 m; to touch is no pass.
+    encounter, driver = in_conflict(in_the_way(20.012), plan(margin_m=0.0)), ConstantDeceleration(a_max_mps2=8.0)
+    np.testing.assert_allclose(passing(encounter, driver, 0.0), [[-np.inf, 1.3762]], atol=1e-4)
+
+
 def test_probability_to_pass_with_one_interval() -> None:
     # `in_the_way`: with 8 m/s² it passes when it begins before 1.325 s (2 + 10 b + 6.25 = 21.5).
     between_s = passing(in_conflict(in_the_way(20)), ConstantDeceleration(a_max_mps2=8.0), 0.5)

@@ -331,6 +331,10 @@ class TestOracle:
         if near_m > step_m:
             assert not found
 
+    @pytest.mark.parametrize(("y_m", "expected"), [(2.0, True), (2.001, False)])
+    def test_boxes_that_stand_side_by_side_meet_where_they_touch(self, y_m: float, expected: bool) -> None:
+        assert _will_be_in(0.0, y_m, 0.0, 0.0, 0.0, 4.0, 2.0, np.array([0.0, 0.0, 0.0, 4.0, 2.0]), 3.0) is expected
+
     @given(drawn=logs(), horizon_s=st.floats(0.1, 4), margin_m=st.floats(0, 1.5))
     @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     def test_corridor_is_what_the_ego_sweeps(self, drawn: Drawn, horizon_s: float, margin_m: float) -> None:

@@ -400,6 +400,18 @@ class TestLeftovers:
         assert again(call).lines == [self.removed(path) if equal else self.kept(path)]
         assert (old / "notes.txt").read_text() == "mine\n"
 
+    def test_with_a_link_of_the_users_to_a_folder_go_and_the_folder_stays(
+        self, here: Path, old: Path, call: Call
+    ) -> None:
+        path = self.left(old, [], [], {"results/theirs": "e/theirs"})
+        (here / "theirs").mkdir()
+        (here / "theirs/notes.txt").write_text("mine\n")
+        (path / "results").mkdir()
+        for link in (old / "theirs", path / "results/theirs"):
+            link.symlink_to(here / "theirs")
+        assert again(call).lines == [self.removed(path)]
+        assert (here / "theirs/notes.txt").read_text() == "mine\n"
+
     def test_a_folder_that_was_moved_away_is_put_back(self, old: Path, call: Call) -> None:
         before = written(old)
         path = self.left(old, [f"{at}/{name}" for at in ("old", "results") for name in before], ["results/summary.csv"])
