@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from copem_replay.communication.arrivals import fusion_schedule
+from copem_replay.communication.arrivals import FusionSchedule, fusion_schedule
 from copem_replay.communication.kept import Sent, kept_entries
 from copem_replay.core.tracks import Float, Int, Tracks
 
@@ -21,6 +21,15 @@ def lists(unit_ix: Int, captured_s: Float, arrives_s: Float) -> Tracks:
         frame_unit_ix=unit_ix, arrives_s=arrives_s[None], valid=np.ones((1, F), dtype=bool),
         **dict.fromkeys(names, zero),
     )  # fmt: skip
+
+
+def test_a_part_of_the_instants_has_the_lists_that_arrived_at_each() -> None:
+    whole = FusionSchedule(
+        np.array([1.0, 2.0, 3.0, 4.0]), np.array([[0], [2], [2], [3]]), np.arange(4), np.array([0, 1, 3, 3, 4])
+    )
+    part = whole.between(2.0, 4.0)
+    assert (part.issue_s.tolist(), part.newest.tolist()) == ([2.0, 3.0], [[2], [2]])
+    assert (part.arrived.tolist(), part.arrived_start.tolist()) == ([1, 2], [0, 2, 2])
 
 
 @pytest.mark.parametrize("seed", range(20))

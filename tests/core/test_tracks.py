@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from copem_replay.core.followed import followed_by
 from copem_replay.core.tracks import CLASS_GROUPS, CLASSES, UNCERTAINTIES, VALUES, Scene, Tracks, class_indices
 
 Seen = dict[str, list[list[str]]]
@@ -216,6 +217,19 @@ class TestClasses:
     )
     def test_indices(self, names: tuple[str, ...], expected: list[str]) -> None:
         assert [CLASSES[k] for k in class_indices(names)] == expected
+
+
+def test_what_follows_without_variances_has_none_to_speak_of() -> None:
+    seen = {"a": [["anna"], ["bert"]]}
+    stating, exact = tracks(seen, runs=1), tracks(seen, runs=1, exact=UNCERTAINTIES)
+    one_way, other_way, never = followed_by(stating, exact), followed_by(exact, stating), followed_by(exact, exact)
+    for name in UNCERTAINTIES:
+        stated = getattr(stating, name)[0].tolist()
+        assert getattr(one_way, name).tolist() == [[*stated, 0.0, 0.0]]
+        assert getattr(other_way, name).tolist() == [[0.0, 0.0, *stated]]
+        assert getattr(never, name) is None
+    assert one_way.start.tolist() == [0, 1, 2, 3, 4]
+    assert one_way.object_ix.tolist() == [0, 1, 0, 1]
 
 
 def test_scene() -> None:

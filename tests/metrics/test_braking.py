@@ -1452,6 +1452,15 @@ def test_how_far_a_corner_moves_while_the_ego_turns() -> None:
     assert turning(path[:2], np.array([4.0, 3.0])) == 1.0
 
 
+def test_who_passes_between_two_instants_and_turns_away_is_as_near_as_it_passed() -> None:
+    """2 m boxes; the other goes by 3 m off within one step, and is farther off at each instant."""
+    path, box = np.array([[0.0, 0, 0, 0], [1e-6, 1e-6, 0, 0]]), np.array([2.0, 2.0])
+    near, touch = np.empty(1), np.empty(1)
+    other = np.array([[-5.0, 15.0, -15.0], [3.0, 3.0, 20.0], [0.0, 0.0, 0.0]])  # x, y, yaw
+    nearest(np.zeros((1, 3)), path, box, other, box, near, touch)
+    assert (near[0], touch[0]) == (pytest.approx(1.0), np.inf)
+
+
 @pytest.mark.parametrize("who", ["ego", "other"])
 def test_a_bar_that_turns_on_the_spot_hits_what_it_sweeps_over(who: str) -> None:
     """10 m × 1 m, by half a turn: before and after 2.5 m from a box that its end reaches half way."""

@@ -167,6 +167,13 @@ def test_captures_of_two_units_within_half_a_period_are_one_hit() -> None:
     assert of_two_units(lists, [1.0, 1.3, 2.3], captures) == 2.3
 
 
+def test_one_capture_is_one_hit_though_it_is_its_units_first_and_another_unit_was_earlier() -> None:
+    captures = Captures(np.array([2.0, 3.0, 1.0]), np.array([0, 0, 1]), np.array([1, 2, 0]))
+    lists = [[], [Item(7, 2.0)], [Item(7, 3.0)]]
+    assert of_two_units(lists[:2], [1.0, 2.0], captures) is None
+    assert of_two_units(lists, [1.0, 2.0, 3.0], captures) == 3.0
+
+
 def test_a_capture_nobody_made_goes_back_to_the_instant_before() -> None:
     lists = [[Item(7, 1.5)], [Item(7, 1.7)], [Item(7, 2.5)]]
     assert found(lists, [1.6, 1.8, 2.6], hits=2, of=2, captured_s=[1, 2])[0] == (2.6, 2.5, 0)

@@ -91,6 +91,12 @@ class TestClasses:
         top = 1 - 2.0**-53
         assert drawn_class(row, np.zeros(1, dtype=int), np.array([top])).tolist() == [2]
 
+    def test_a_number_on_a_bound_draws_the_class_above_it(self) -> None:
+        row = np.zeros((1, len(CLASSES)))
+        row[0, 1:3] = [0.25, 0.75]
+        uniform = np.array([0.0, 0.2499, 0.25])
+        assert drawn_class(row, np.zeros(3, dtype=int), uniform).tolist() == [1, 1, 2]
+
     def test_ideal_fusion_keeps_the_true_class(self) -> None:
         sure, wrong = plan_of({}), plan_of({"classes": {"confusion": {"pedestrian": {"car": 1.0}}}})
         told, mistaken = run(sure, [standing_child(2.0)]).table, run(wrong, [standing_child(2.0)]).table

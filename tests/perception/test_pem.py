@@ -385,6 +385,9 @@ class TestGaussian:
         a, b = math.sqrt(2), math.sqrt(3)
         gaussian([[a * a, a * b], [b * a, b * b]])
         gaussian([[0.1 + 0.2, 0.3], [0.3, 0.3]])
+        gaussian([[1.0, 1e-9], [0.0, 1.0]])
+        with pytest.raises(ValidationError, match="symmetric"):
+            gaussian([[1.0, 1.1e-9], [0.0, 1.0]])
 
     @pytest.mark.parametrize(
         "covariance_m2",
