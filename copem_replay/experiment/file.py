@@ -177,7 +177,7 @@ def _places(source: Source, k: int, pattern: str | None) -> list[Place]:
 
 
 def _unasked(source: Source, k: int, pattern: str | None) -> str | None:
-    """Why nobody can tell what an entry of `logs` names."""
+    """Why it cannot be told what an entry of `logs` names."""
     if pattern is None:
         elsewhere = filter(is_url, source.data["logs"][k]["together"])
         return next((f"expected recordings on this machine, found {bare(url)}" for url in elsewhere), None)

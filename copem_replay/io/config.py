@@ -11,10 +11,10 @@ from copem_replay.io.schemas.object_lists import Fields
 
 
 class Recorded(Frozen):
-    """Lists as they were recorded in the log, on a topic of osi3.SensorData, instead of a PEM.
+    """The lists of a unit as they were recorded in the log on a topic, instead of a PEM.
 
-    `delay_s`: how long before its stamp a list was captured, where its messages don't say; `covariance_m2` of its
-    positions and `existence` of its entries likewise.
+    Used where the messages state none: `delay_s`, the time from the capture of a list to its stamp; `covariance_m2` of
+    its positions; `existence` of its entries.
     """
 
     topic: Annotated[str, Field(min_length=1)]
@@ -24,23 +24,23 @@ class Recorded(Frozen):
 
 
 class RecordedOutput(Recorded):
-    """The fused lists of a stack as they were recorded, in the place of units and a fusion.
+    """The fused lists of a stack as they were recorded, instead of units and a fusion.
 
-    `delay_s`: how long before the stamp of a list its states were so, where its messages don't say; with
-    `tells_of: available` the stack predicts them to the instant its list is available.
+    `delay_s`: the age of a list's states at its stamp, where its messages state none; with `tells_of: available` the
+    stack predicts the states to the instant at which its list is available.
     """
 
     tells_of: Literal["stamp", "available"] = "stamp"
 
 
 class Read(Frozen):
-    """How the truth is found in a recording that holds several object lists."""
+    """The topic of the truth in a recording that holds several object lists."""
 
     topic: str | None = None
 
 
 class ReadFields(Fields):
-    """How the truth is read from a topic of a schema that is not known by name: which of its fields are what."""
+    """The truth on a topic whose schema is not known by name: which of its fields hold what."""
 
     topic: Annotated[str, Field(min_length=1)]
 
@@ -48,8 +48,8 @@ class ReadFields(Fields):
 class EgoTopic(Frozen):
     """An ego that is no object of any list: its poses are on a topic (odometry, stamped poses, transforms).
 
-    `size_m`: length, width, height. `centre_from_rear_axle_m`: how far ahead of its poses, which are on the ground, the
-    centre of its box is. `frame`: whose poses, where the topic has those of several.
+    `size_m`: length, width, height. `centre_from_rear_axle_m`: the distance from its poses, which are on the ground,
+    forward to the centre of its box. `frame`: the frame of the ego, where the topic has poses of several.
     """
 
     topic: Annotated[str, Field(min_length=1)]

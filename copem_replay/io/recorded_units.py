@@ -27,7 +27,7 @@ from copem_replay.io.recorded_osi import RecordedLists
 from copem_replay.io.recording import Recording
 
 OWN_BODY_M = 0.5
-"""So far beside the ego's box the centre of its own body is listed (chosen: nobody else's can be that near)."""
+"""So far beside the ego's box the centre of its own body is listed (chosen: no other body can be that near)."""
 
 
 @dataclass(frozen=True)

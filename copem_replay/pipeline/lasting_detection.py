@@ -86,8 +86,8 @@ def _part(pem: Pem, name: str, unit: str) -> Part | None:
     if any((one.correlation_s, one.of, one.path) != (first.correlation_s, first.of, first.path) for one in others):
         raise _refused(name, f"detection of unit {unit} lasts otherwise from couple to couple, which has no closed "
                        "form; give all one correlation_s and `of`")  # fmt: skip
-    if first.path == "drifts" and first.correlation_s != "always":
-        raise _refused(name, f"detection of unit {unit} drifts, which has no closed form; use `path: held`")
+    if first.path not in (None, "held") and first.correlation_s != "always":
+        raise _refused(name, f"detection of unit {unit} {first.path}, which has no closed form; use `path: held`")
     return first
 
 

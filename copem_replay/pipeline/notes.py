@@ -89,7 +89,7 @@ def oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) ->
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has no object to carry it ({', '.join(unit.on.classes)})"
     yield from _clocks(experiment)
-    yield from _beside_nobody(replay, experiment)
+    yield from _beside_no_object(replay, experiment)
     end_s = replay.scene.end_s
     for name, configuration in experiment.configurations.items():
         units = experiment.units_of(configuration) or (TRUTH,)
@@ -106,7 +106,7 @@ def _clocks(experiment: Experiment) -> Iterator[str]:
             yield f"configuration {name}: ideal fusion uses true captures, ignoring clock errors of {', '.join(off)}"
 
 
-def _beside_nobody(replay: Replay, experiment: Experiment) -> Iterator[str]:
+def _beside_no_object(replay: Replay, experiment: Experiment) -> Iterator[str]:
     """Ghosts beside objects that the log does not have."""
     there = set(replay.scene.object_class.tolist())
     for name, pem in experiment.pems.items():

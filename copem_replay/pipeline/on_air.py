@@ -58,7 +58,7 @@ def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
             asked, where = True, f"{scene.log}: {one.where}.reception: {one.link.reception.kind}"
             if scene.ego_ix < 0:
                 raise ExperimentError(
-                    f"{where}: nobody knows the distance to a receiver, the log has no ego; use constant"
+                    f"{where}: the distance to a receiver is unknown, for the log has no ego; use constant"
                 )
             units = experiment.units_of(configuration) if one.units is None else one.units
             far = [TRUTH] if configuration.units == TRUTH else sorted(experiment.recorded.keys() & set(units))

@@ -284,7 +284,7 @@ def test_without_a_receiver_there_is_no_distance() -> None:
     with pytest.raises(ExperimentError) as caught:
         run(some, [alone])
     expected = (
-        "links.v2x.reception: shadowing: nobody knows the distance to a receiver, the log has no ego; use constant"
+        "links.v2x.reception: shadowing: the distance to a receiver is unknown, for the log has no ego; use constant"
     )
     assert str(caught.value) == f"scene: {expected}"
 

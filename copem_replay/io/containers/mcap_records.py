@@ -102,7 +102,7 @@ class _Exact(ReadDataStream):
 
 
 def parsed(opcode: int, body: bytes) -> McapRecord | None:
-    """The record of an opcode that is no chunk, None where nobody here needs it. Raises DAMAGE."""
+    """The record of an opcode that is no chunk, None where nothing here needs it. Raises DAMAGE."""
     if opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
         return Message(

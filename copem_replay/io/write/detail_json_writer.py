@@ -3,8 +3,8 @@
 One message per list on `copem/<configuration>/detail`: the full covariance and variances of each object, the entries of
 the units' lists it was made of (parallel lists of unit, capture, range, visible share), and what was detected with it.
 Of a fusion without truth ids: what it claims of the existence, and no entries. Objects are in the order of the list.
-Where units have ghosts or outages, `ghosts` are the entries about nobody in the lists that came in with this one, and
-`down` the units whose last list was not made.
+Where units have ghosts or outages, `ghosts` are the entries about no object in the lists that came in with this one,
+and `down` the units whose last list was not made.
 """
 
 from __future__ import annotations

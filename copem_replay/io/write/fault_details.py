@@ -15,7 +15,7 @@ _TOLERANCE_S = SAME_INSTANT_NS * 1e-9
 
 
 def faults_by_list(fused_tracks: FusedTracks) -> list[dict[str, Any]]:
-    """For each fused list `ghosts`, entries about nobody in the lists that came in with it, and `down`, units.
+    """For each fused list `ghosts`, entries about no object in the lists that came in with it, and `down`, units.
 
     A unit is down while the last list that it should have captured was not made. Empty: no unit has such faults.
     """

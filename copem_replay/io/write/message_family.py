@@ -46,7 +46,7 @@ from copem_replay.io.write.status import STATUSES, Statuses, StatusWriter
 from copem_replay.io.write.uncertainty import Ellipses, UncertaintyWriter
 
 OSI_CHANNEL = "net.asam.osi.trace.channel."
-_NAMELESS = "map"  # chosen: what the world is called where nobody says it, as REP 105 has it
+_NAMELESS = "map"  # chosen: the name of the world frame where none is given, as REP 105 has it
 
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"
 QOS = (
