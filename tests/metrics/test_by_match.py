@@ -354,7 +354,8 @@ def test_as_the_sentences_have_it(
         some, rows = between(lists, a, b)
         adding.add(some, taken(matches, rows), issue_s[a:b])
     for whole, parts in zip((detections, steps), adding.result(), strict=True):
-        for name, column in vars(whole).items():
+        for name in type(whole).__annotations__:
+            column = getattr(whole, name)
             np.testing.assert_array_equal(getattr(parts, name), column)
             assert getattr(parts, name).dtype == column.dtype
 

@@ -240,7 +240,7 @@ def test_refusals() -> None:
         plan(None).as_written() | {"units": {"mast": {**MAST, "sends": {}}}}
     )
     exact = plan({"interval_s": 0.5}, measure={"exact": True, "accuracy": False})
-    with pytest.raises(ExperimentError, match="sends by rules"):
+    with pytest.raises(ExperimentError, match="`sends` rules that depend on earlier messages"):
         check_exact([prepare(recorded(), exact)], exact)
-    assert "unit 'mast' sends by rules" in said(exact.as_written())
+    assert "unit 'mast' has `sends` rules that depend on earlier messages" in said(exact.as_written())
     assert "sends" not in str(plan(None).as_written())

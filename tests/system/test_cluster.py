@@ -58,7 +58,7 @@ def start(here: Path) -> Iterator[Start]:
 
 
 def scheduler(start: Start, port: int = 0) -> tuple[subprocess.Popen[str], str]:
-    """A scheduler that has written `scheduler.json`, and its address."""
+    """A scheduler that writes `scheduler.json`, and its address."""
     command = f"dask scheduler --host 127.0.0.1 --port {port} --no-dashboard --scheduler-file scheduler.json"
     process = start(command)
     assert process.stderr is not None
@@ -74,12 +74,12 @@ def files(out: str) -> dict[str, bytes]:
 def test_commands_of_the_guide(here: Path, start: Start) -> None:
     cr.run("e.yaml").save("plain")
     scheduler(start)
-    assert json.loads(Path("scheduler.json").read_text())["address"].startswith("tcp://127.0.0.1:")
     start("dask worker --scheduler-file scheduler.json --nworkers 2 --nthreads 1 --host 127.0.0.1 --no-dashboard")
     command = [BIN / "copem-replay", "run", "e.yaml", "--cluster", "scheduler.json", "--out", "study"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == "pieces: 18 computed, 0 found in study.pieces\n"
+    assert json.loads(Path("scheduler.json").read_text())["address"].startswith("tcp://127.0.0.1:")
     assert files("study") == files("plain")
 
 

@@ -34,6 +34,8 @@ WAIT_S = 600.0
 _ANSWERS_S = 10.0
 _LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
 _PROBE = "probe.txt"
+_GONE = (OSError, RuntimeError)
+"""The scheduler does not answer (a TimeoutError is an OSError), or the client has closed itself for that."""
 
 
 def check_address(address: str) -> None:
@@ -82,7 +84,7 @@ class DaskWorkers(Workers):
         """How many tasks it does at once."""
         if self._changed:
             self._changed = False
-            with suppress(OSError):  # gone: futures say so
+            with suppress(*_GONE):  # futures say so
                 self._threads = max(sum(self._client.nthreads().values()), 1)
         return self._threads
 
@@ -101,8 +103,9 @@ class DaskWorkers(Workers):
         """Wait for the scheduler and a worker. Raises TimeoutError; CopemError as at the beginning."""
         until_s = time.monotonic() + self._wait_s
         while time.monotonic() < until_s:
-            with suppress(OSError):  # which a TimeoutError is
+            with suppress(*_GONE):
                 self._client.close(timeout=1)
+            with suppress(*_GONE):
                 self._client = self._connected(until_s - time.monotonic())
                 self._begin(until_s)
                 return
@@ -110,11 +113,11 @@ class DaskWorkers(Workers):
 
     def close(self) -> None:
         """Cancel what has not begun, and end what was begun here."""
-        with suppress(OSError):  # which a TimeoutError is
+        with suppress(*_GONE):
             self._forget()
             self._client.close(timeout=1)
         if self._cluster is not None:
-            with suppress(OSError):
+            with suppress(*_GONE):
                 self._cluster.close(timeout=10)
 
     def _forget(self) -> None:
