@@ -73,10 +73,10 @@ def _one(way: str, folder: Path) -> None:
     began_s = time.perf_counter()
     workers = DaskWorkers(way, Pieces("warm"), 2)
     warm = Crew(workers, pieces := Pieces("warm"))  # kernels are loaded in the workers, too
-    with_crew(lambda: study_of("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(pieces, warm)), warm)
+    with_crew(lambda: study_of("e.yaml", ["drive00.mcap", "drive01.mcap"], LogSurvey(pieces), warm), warm)
     start_s, began_s = time.perf_counter() - began_s, time.perf_counter()
     hands = Crew(workers, pieces := Pieces("kept"))
-    study = with_crew(lambda: study_of("e.yaml", None, LogSurvey(pieces, hands)), hands)
+    study = with_crew(lambda: study_of("e.yaml", None, LogSurvey(pieces), hands), hands)
     computed_s = time.perf_counter() - began_s
     result = replayed(study, prepared(study)[0], 1, None, pieces)
     took_s = time.perf_counter() - began_s
