@@ -58,11 +58,12 @@ def _stacked(parts: Sequence[Any]) -> Any:
     first: Any = parts[0]
     if isinstance(first, np.ndarray):
         return np.concatenate(parts)
-    if isinstance(first, Detections):
-        return Detections(*map(_stacked, zip(*parts, strict=True)))
+    if hasattr(first, "_fields"):
+        return type(first)(*map(_stacked, zip(*parts, strict=True)))
     if is_dataclass(first):
         columns = {f.name: _stacked([getattr(part, f.name) for part in parts]) for f in fields(first)}
         return replace(first, **columns)  # type: ignore[type-var]
+    assert all(part == first for part in parts), f"{type(first).__name__} is not of all runs alike"
     return first
 
 

@@ -7,6 +7,7 @@ same bytes, whoever computed and in whatever order.
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
@@ -42,23 +43,23 @@ class TaskFailedError(RuntimeError):
     """A defect that showed in a task: where, and the traceback of the worker."""
 
 
-class Workers(Executor):
+class Workers(Executor, ABC):
     """An executor that knows its workers. `lost`: how many have died; `again`: how many pieces they had to give up."""
 
     lost = 0
     again = 0
 
+    @abstractmethod
     def threads(self) -> int:
         """How many tasks it does at once."""
-        raise NotImplementedError
 
+    @abstractmethod
     def give(self, task: Task) -> Future[Receipt]:
         """Submit a task."""
-        raise NotImplementedError
 
+    @abstractmethod
     def come_back(self) -> None:
         """Wait until tasks can be submitted again. Raises TimeoutError."""
-        raise NotImplementedError
 
 
 class _Plain(Workers):

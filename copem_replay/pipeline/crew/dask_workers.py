@@ -105,7 +105,7 @@ class DaskWorkers(Workers):
         while time.monotonic() < until_s:
             with suppress(*_GONE):
                 self._client.close(timeout=1)
-            with suppress(*_GONE):
+            with suppress(OSError):  # which a TimeoutError is
                 self._client = self._connected(until_s - time.monotonic())
                 self._begin(until_s)
                 return
