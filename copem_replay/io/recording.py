@@ -80,6 +80,11 @@ class Recording:
         return self.path if self.together is None else self.together
 
     @property
+    def object_states(self) -> int:
+        """How many states it has in memory, of the truth and of all recorded lists."""
+        return sum(len(one.frame_ix) for one in (self.truth, *(of.tracks for of in self.lists.values())))
+
+    @property
     def paths(self) -> tuple[Path, ...]:
         """The files or folders of this machine that it is read from."""
         if self.remote is not None:

@@ -5,8 +5,12 @@ Whole numbers, so that counts of any runs in any order add up to the same.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
+
+from copem_replay.core.tracks import Int
 
 DETECTED = "detected"
 """The event of the first list that confirms the object."""
@@ -48,23 +52,28 @@ def _of_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
     time_s = np.where(known, time_s + 0.0, np.inf)  # −0 is 0, and never comes last
     episode = np.zeros(len(rows), dtype=np.int64)
     for name in ("log", "configuration", "object_id"):
-        number, names = pd.factorize(rows[name])
-        episode = episode * max(len(names), 1) + number
-    episode = pd.factorize(episode)[0]
-    order = np.lexsort((time_s, episode))
-    new = np.ones(len(rows), dtype=bool)
-    new[1:] = (np.diff(episode[order]) != 0) | (time_s[order][1:] != time_s[order][:-1])
-    first_of, group = order[new], np.cumsum(new) - 1
+        episode = _pairs(episode, rows[name])[0]
+    group, number, instant_s = _pairs(episode, time_s)
+    first_of = np.empty(len(number), dtype=np.int64)
+    first_of[group[::-1]] = np.arange(len(rows))[::-1]
+    order = np.lexsort((instant_s, number))
+    first_of, runs = first_of[order], np.bincount(group, minlength=len(order))[order]
     found = {
-        "log": rows["log"].to_numpy()[first_of],
-        "configuration": rows["configuration"].to_numpy()[first_of],
-        "event": np.full(len(first_of), event, dtype=object),
-        **{name: rows[name].to_numpy()[first_of] for name in _OF_OBJECT if name in rows},
-        **{name: rows[of].to_numpy()[first_of] for name, of in columns.items()},
-        "runs": np.bincount(group, minlength=len(first_of)),
+        **{name: rows[name].take(first_of).to_numpy() for name in ("log", "configuration")},
+        "event": np.full(len(order), event, dtype=object),
+        **{name: rows[name].take(first_of).to_numpy() for name in _OF_OBJECT if name in rows},
+        **{name: rows[of].take(first_of).to_numpy() for name, of in columns.items()},
+        "runs": runs,
     }
     if "conflict" in rows:
-        passed = rows["braking_pass"].fillna(False).to_numpy(dtype=bool)[order]
+        passed = rows["braking_pass"].fillna(False).to_numpy(dtype=bool)
         found["in_conflict"] = rows["conflict"].to_numpy(dtype=bool)[first_of]
-        found["passed"] = np.bincount(group, passed, minlength=len(first_of)).astype(np.int64)
+        found["passed"] = np.bincount(group, passed, minlength=len(order)).astype(np.int64)[order]
     return pd.DataFrame(found)
+
+
+def _pairs(number: Int, values: Any) -> tuple[Int, Int, Any]:
+    """Which pair of number and value each row (n,) has, counted as pairs appear, and the pairs. By hash, not sorted."""
+    of, found = pd.factorize(values)
+    pair, pairs = pd.factorize(number * max(len(found), 1) + of)
+    return pair, pairs // max(len(found), 1), found[pairs % max(len(found), 1)]

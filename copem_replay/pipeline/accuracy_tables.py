@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, joined
-from copem_replay.metrics.columns import beneath, frame
+from copem_replay.metrics.columns import beneath
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.blocks import Outcome
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from copem_replay.pipeline.scoring import Scores
 
 
-def with_accuracy(*outcomes: Outcome) -> pd.DataFrame:
-    """The rows of `detections` with the figures of each, block after block."""
+def with_accuracy(*outcomes: Outcome) -> dict[str, Any]:
+    """The columns of `detections` with the figures of each row, block after block."""
     parts = [_row_columns(one) for outcome in outcomes for _, _, one in accuracies(outcome)]
     columns = beneath([outcome.columns for outcome in outcomes])
-    return frame(columns | (beneath(parts) if parts else {}))
+    return columns | (beneath(parts) if parts else {})
 
 
 def _row_columns(accuracy: Accuracy) -> dict[str, Any]:

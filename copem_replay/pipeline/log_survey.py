@@ -41,11 +41,8 @@ class LogSurvey:
 
         Raises ExperimentError.
         """
-        states = sum(
-            len(lists.frame_ix) for lists in (recording.truth, *(one.tracks for one in recording.lists.values()))
-        )
-        if not self._states or self._states + states <= STATES_HELD:
-            self._states += states
+        if not self._states or self._states + recording.object_states <= STATES_HELD:
+            self._states += recording.object_states
             return recording
         from copem_replay.pipeline.memory import size_of
         from copem_replay.pipeline.prepare import prepare

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from copem_replay.core.tracks import Float, Int
 from copem_replay.metrics.accuracy.statistics import Accuracy, Total, total
+from copem_replay.metrics.columns import frame
 from copem_replay.metrics.way import WAY
 from copem_replay.pipeline.accuracy_tables import accuracies, with_accuracy
 
@@ -58,11 +59,12 @@ class LogTables:
         """Those of one configuration. `way`: whether it has the columns `WAY`, whatever others have."""
         assert isinstance(self.rows, pd.DataFrame)
         mine = (self.rows["configuration"] == configuration).to_numpy()
-        beside, runs = self.beside, self.runs
+        begin, count = int(mine.argmax()) if len(mine) else 0, int(mine.sum())
+        rows, beside, runs = self.rows.iloc[begin : begin + count], self.beside, self.runs
         return LogTables(
             self.log,
-            self.rows[mine] if way else self.rows[mine].drop(columns=list(WAY), errors="ignore"),
-            None if beside is None else beside.filter(pa.array(mine)),
+            rows if way else rows.drop(columns=list(WAY), errors="ignore"),
+            None if beside is None else beside.slice(begin, count),
             None if runs is None else runs.filter(np.array(runs["configuration"].to_pylist()) == configuration),
             {name: nodes for name, nodes in self.totals.items() if name == configuration},
         )
@@ -70,15 +72,16 @@ class LogTables:
 
 def log_tables(log: str, outcomes: Sequence[Outcome], names: Sequence[str], *, accuracy: bool) -> LogTables:
     """The tables of blocks of runs of one log, which may be scattered over them, in configurations of these `names`."""
-    rows = with_accuracy(*outcomes)
-    number = rows["configuration"].map({name: k for k, name in enumerate(names)}).to_numpy()
-    order = np.lexsort((rows["run"].to_numpy(), number))
+    columns = with_accuracy(*outcomes)
+    counts = [len(one.columns["run"]) // max(len(names), 1) for one in outcomes]  # of each configuration
+    number = np.concatenate([np.repeat(np.arange(len(names)), count) for count in counts])
+    order = np.lexsort((columns["run"], number))
     totals = {}
     for name in names:
         if mine := list(_runs_of(outcomes, name)):
             mine.sort(key=lambda part: part[0])
             totals[name] = [(sum(len(one.by_run) for _, one in mine), total([one for _, one in mine]))]
-    ordered = rows.iloc[order].reset_index(drop=True)
+    ordered = frame({name: values[order] for name, values in columns.items()})
     if not accuracy or not names:
         return LogTables(log, ordered, totals=totals)
     return LogTables(log, ordered, _beside(outcomes).take(pa.array(order)), _runs(outcomes, names), totals)

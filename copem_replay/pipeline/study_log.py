@@ -119,7 +119,7 @@ def survey_key(place: Place, experiment: Experiment) -> str:
     """All that is known of a log depends on: its files as they are now, and the experiment, resolved for it."""
     of_all, own = _of_every_log(experiment)
     ahead_ns = place.ahead_ns if isinstance(place, Together) else ()
-    return canonical({"files": _stamps(place), "ahead_ns": ahead_ns, "of": of_all, "own": digests(own)})
+    return canonical({"files": stamps(place), "ahead_ns": ahead_ns, "of": of_all, "own": digests(own)})
 
 
 @for_all_logs
@@ -129,7 +129,7 @@ def _of_every_log(experiment: Experiment) -> tuple[str, list[Component]]:
     return of_all, own_components(experiment)
 
 
-def _stamps(place: Place) -> list[tuple[object, ...]]:
+def stamps(place: Place) -> list[tuple[object, ...]]:
     """Which files they are, their sizes, and what changes with their content."""
     if isinstance(place, Remote):  # which is not asked for a content that it does not tell from another
         return [(str(place), *(place.stamp or (uuid4().hex,)))]

@@ -14,6 +14,7 @@ from scipy.special import ndtri
 from copem_replay.core.random import CounterRng, RandomKey, normal_quantile, object_words, philox4x32, stable_hash
 from copem_replay.core.tracks import Tracks
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.columns import frame
 from copem_replay.pipeline.accuracy_tables import with_accuracy
 from copem_replay.pipeline.blocks import blocks, outcomes
 from copem_replay.pipeline.one_run import tracks_of_run
@@ -149,7 +150,7 @@ def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
     whole = run(plan(), [log]).table
     ready = prepare(log, plan())
     for cut in ([0], [5], [11], [3, 4, 5], [0, 7]):
-        part = pd.concat([with_accuracy(one) for one in outcomes(ready, plan(), np.array(cut))])
+        part = pd.concat([frame(with_accuracy(one)) for one in outcomes(ready, plan(), np.array(cut))])
         expected = rows_of(whole, run=cut)
         keys = ["configuration", "run", "object_id"]
         assert part.sort_values(keys).reset_index(drop=True).equals(expected.sort_values(keys).reset_index(drop=True))

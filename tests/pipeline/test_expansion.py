@@ -28,6 +28,7 @@ from copem_replay.experiment.against_log import against_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.columns import frame
 from copem_replay.perception.config import Carriers
 from copem_replay.pipeline.accuracy_tables import with_accuracy
 from copem_replay.pipeline.blocks import outcomes
@@ -464,7 +465,7 @@ class TestRuns:
 
 def block(ready: Replay, wanted: Experiment, runs: Int) -> pd.DataFrame:
     """The rows of some runs, how far off the lists were among them."""
-    return pd.concat([with_accuracy(part) for part in outcomes(ready, wanted, runs)], ignore_index=True)
+    return pd.concat([frame(with_accuracy(part)) for part in outcomes(ready, wanted, runs)], ignore_index=True)
 
 
 def one_by_one(wanted: Experiment, log: Recording) -> None:

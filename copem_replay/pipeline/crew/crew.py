@@ -53,6 +53,10 @@ class Workers(Executor, ABC):
     def threads(self) -> int:
         """How many tasks it does at once."""
 
+    def next(self, tasks: deque[Task]) -> Task:
+        """Take out the task to be done next."""
+        return tasks.popleft()
+
     @abstractmethod
     def give(self, task: Task) -> Future[Receipt]:
         """Submit a task."""
@@ -210,7 +214,7 @@ class Crew:
             while waiting or suspects or flying:
                 source, at_once = (waiting, self._workers.threads()) if waiting or flying else (suspects, 1)
                 while source and len(flying) < at_once:
-                    task = source.popleft()
+                    task = self._workers.next(source)
                     if identity(task.log.place) not in self._lost:
                         flying[self._workers.give(task)] = task
                 finished, _ = wait(flying, TICK_S, FIRST_COMPLETED)

@@ -12,7 +12,7 @@ import re
 import secrets
 import time
 import warnings
-from collections import Counter
+from collections import Counter, deque
 from concurrent.futures import CancelledError, Future, InvalidStateError
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any
 from copem_replay.core.errors import CopemError, InputError
 from copem_replay.core.remote import is_url
 from copem_replay.pipeline.crew.crew import WorkerDiedError, Workers
-from copem_replay.pipeline.crew.task import Receipt, Task
+from copem_replay.pipeline.crew.task import LogTask, Receipt, Task
 from copem_replay.pipeline.crew.worker import differs, done
 from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.recipe import fingerprint
@@ -32,6 +32,8 @@ MOST_DEATHS = 3
 WAIT_S = 600.0
 """So long a scheduler that has gone, or has no worker, is waited for (chosen: a machine is up again by then)."""
 _ANSWERS_S = 10.0
+_LOOKS = 1000
+"""Among so many tasks one is looked for whose log a worker has in memory (chosen)."""
 _LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
 _PROBE = "probe.txt"
 _GONE = (OSError, RuntimeError)
@@ -64,6 +66,7 @@ class DaskWorkers(Workers):
         self._given: dict[str, tuple[Future[Receipt], int]] = {}  # and how many pieces, by the keys of Dask
         self._unwanted: list[Any] = []
         self._deaths, self._beside = Counter[str](), set[str]()  # … while others of ours were there
+        self._has, self._idle = dict[LogTask, str](), list[str]()  # who has which log in memory, and nothing to do
         self._threads, self._changed = 1, True
         logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # what matters is said in our own words
         self._cluster = _local(int(address.partition(":")[2] or cores)) if _LOCAL.fullmatch(address) else None
@@ -88,15 +91,29 @@ class DaskWorkers(Workers):
                 self._threads = max(sum(self._client.nthreads().values()), 1)
         return self._threads
 
+    def next(self, tasks: deque[Task]) -> Task:
+        """Take out the first task whose log is in memory of a worker that has just become idle; else the first.
+
+        Dask gives it to that worker, for the others are busy. Asking for a worker by name is worse: a task that is to
+        be done by one that has died, or by any other, waits for ever where for a moment there was no worker at all.
+        """
+        while self._idle:
+            idle = self._idle.pop()
+            for k, task in zip(range(_LOOKS), tasks, strict=False):
+                if self._has.get(task.log) == idle:
+                    del tasks[k]
+                    return task
+        return tasks.popleft()
+
     def give(self, task: Task) -> Future[Receipt]:
         """Submit a task."""
         self._forget()
         mine: Future[Receipt] = Future()
         key = f"copem-{secrets.token_hex(8)}"
         self._given[key] = mine, len(task.keys)
-        given = self._client.submit(done, task, key=key, pure=False)
+        given = self._client.submit(_done_at, task, key=key, pure=False)
         mine.add_done_callback(lambda _: self._let_go(key, given))
-        given.add_done_callback(lambda _: _landed(given, mine))
+        given.add_done_callback(lambda _: self._landed(task, given, mine))
         return mine
 
     def come_back(self) -> None:
@@ -173,22 +190,31 @@ class DaskWorkers(Workers):
                 with suppress(InvalidStateError):
                     mine.set_exception(WorkerDiedError(self._deaths[key], host, alone=alone))
 
+    def _landed(self, task: Task, given: Any, mine: Future[Receipt]) -> None:
+        """Hand over what became of a task."""
+        with suppress(InvalidStateError):  # it is not wanted any more
+            try:
+                at, receipt = given.result()
+                self._has[task.log] = at
+                self._idle.append(at)
+                mine.set_result(receipt)
+            except (CancelledError, OSError):  # the scheduler is gone
+                if mine.cancel():
+                    mine.set_running_or_notify_cancel()
+            except Exception as error:
+                mine.set_exception(error)
+
     def _let_go(self, key: str, given: Any) -> None:
         """A task that is done, or not wanted any more. In whatever thread: Dask is told later."""
         del self._given[key]
         self._unwanted.append(given)
 
 
-def _landed(given: Any, mine: Future[Receipt]) -> None:
-    """Hand over what became of a task."""
-    with suppress(InvalidStateError):  # it is not wanted any more
-        try:
-            mine.set_result(given.result())
-        except (CancelledError, OSError):  # the scheduler is gone
-            if mine.cancel():
-                mine.set_running_or_notify_cancel()
-        except Exception as error:
-            mine.set_exception(error)
+def _done_at(task: Task) -> tuple[str, Receipt]:
+    """What a worker answers, and which worker it is."""
+    from distributed import get_worker
+
+    return get_worker().address, done(task)
 
 
 def greeting(expected: dict[str, str], pieces: str, folder: str, token: str) -> tuple[str, str | None, bool]:

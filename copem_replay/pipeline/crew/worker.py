@@ -9,6 +9,7 @@ import resource
 import time
 import traceback
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
@@ -22,10 +23,11 @@ from copem_replay.experiment.validate import Refused, read_logs
 from copem_replay.pipeline.blocks import blocks, outcomes
 from copem_replay.pipeline.closed_form import check_exact, exact_table
 from copem_replay.pipeline.crew.task import LogTask, Receipt, Task, Work
+from copem_replay.pipeline.log_survey import STATES_HELD
 from copem_replay.pipeline.log_tables import LogTables, log_tables
 from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.recipe import fingerprint, key_of, recipe
-from copem_replay.pipeline.study_log import StudyLog
+from copem_replay.pipeline.study_log import StudyLog, stamps
 from copem_replay.pipeline.sweep import points
 
 
@@ -35,6 +37,12 @@ class _Study:
 
     at: tuple[tuple[Experiment, StudyLog], ...] = ()
     refused: tuple[Refused, ...] = ()
+
+    @property
+    def states(self) -> int:
+        """Object states in memory: as each unit sees them, at each point that has units of its own."""
+        mine = {id(log): (experiment, log) for experiment, log in self.at}.values()
+        return sum(max(len(experiment.units), 1) * log.recording.object_states for experiment, log in mine)
 
 
 def done(task: Task) -> Receipt:
@@ -52,7 +60,7 @@ def done(task: Task) -> Receipt:
             os.chdir(task.log.folder)
         except OSError:
             return receipt(problems=(f"{task.log.folder}: not visible from worker {host}",))
-        study = _opened(task.log)
+        study = _opened(task)
         if study.refused:
             return receipt(refused=study.refused)
         if not task.work and (problems := _survey(study)):
@@ -85,18 +93,22 @@ def _short(version: str) -> str:
 
 
 _lock = Lock()
-_last: list[tuple[LogTask, _Study]] = []
-"""The log that was opened last: the next task is often of the same."""
+_kept: dict[tuple[LogTask, str], _Study] = {}
+"""Logs that were opened, the last one last, while their files are as they were: what is surveyed is replayed next."""
 
 
-def _opened(log: LogTask) -> _Study:
+def _opened(task: Task) -> _Study:
+    log = task.log, ""
+    with suppress(OSError):  # that it cannot be read is said when it is
+        log = task.log, repr(stamps(task.log.place))
     with _lock:
-        for known, study in _last:
-            if known == log:
-                return study
-    study = _open(log)
+        study = _kept.pop(log, None)
+    if study is None or not task.work:  # a survey is asked for because something is not known
+        study = _open(task.log)
     with _lock:
-        _last[:] = [(log, study)]
+        _kept[log] = study
+        while len(_kept) > 1 and sum(one.states for one in _kept.values()) > STATES_HELD:
+            del _kept[next(iter(_kept))]
     return study
 
 
