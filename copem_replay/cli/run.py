@@ -91,7 +91,7 @@ def run(
             costs += hint(time.perf_counter() - began_s, workers(jobs))
         notes = fill(place, result, skipped=study.skipped, viewer=url)
         if kept is not None:
-            note(kept.damaged)
+            note(sorted(kept.damaged))
             complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.store.where}"])
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
         note([*place.notes, *skipped, *notes, *costs])

@@ -90,13 +90,10 @@ class AccuracyTables:
     instants: pa.Table
     lists: pa.Table
     thresholds: pa.Table
-    bands: pd.DataFrame
 
 
-def accuracy_tables(
-    logs: Sequence[LogTables], of_logs: Mapping[tuple[str, str], Total], rows: pd.DataFrame, *, same_instants: bool
-) -> AccuracyTables:
-    """All tables of several logs; `of_logs`: their sums, `rows`: those of `detections`."""
+def accuracy_tables(logs: Sequence[LogTables], rows: pd.DataFrame, *, same_instants: bool) -> AccuracyTables:
+    """All tables of several logs; `rows`: those of `detections`."""
     keys = pa.Table.from_pandas(rows[["log", "configuration", "run", "object_id"]], preserve_index=False)
     beside = pa.concat_tables([log.beside for log in logs if log.beside is not None])
     runs = pa.concat_tables([log.runs for log in logs if log.runs is not None])
@@ -108,7 +105,7 @@ def accuracy_tables(
     thresholds = thresholds.append_column("existence", pc.list_flatten(beside["existence"]))
     thresholds = thresholds.append_column("detection_s", pc.list_flatten(beside["steps_s"]))
     lists = runs.drop_columns("available_s")
-    return AccuracyTables(per_list, _instants(runs, same_instants), lists, thresholds, bands(of_logs))
+    return AccuracyTables(per_list, _instants(runs, same_instants), lists, thresholds)
 
 
 def _instants(runs: pa.Table, same: bool) -> pa.Table:

@@ -6,14 +6,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any
 
 import pandas as pd
 import pyarrow as pa
 
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.way import WAY
 from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
 from copem_replay.pipeline.closed_form import exact_table
 from copem_replay.pipeline.cost import Cost
@@ -21,9 +22,17 @@ from copem_replay.pipeline.log_tables import LogTables, joined, log_tables
 from copem_replay.pipeline.pieces import Pieces, ranges
 from copem_replay.pipeline.recipe import recipe
 from copem_replay.pipeline.study_log import StudyLog
+from copem_replay.pipeline.study_tables import StudyTables
 
 Progress = Callable[[int, int], None]
 """`progress(done, total)`, called after each block of runs."""
+
+
+_Found = dict[tuple[str, tuple[int, int]], LogTables | None]
+"""Pieces of a log by configuration and range of runs; None: it is not there."""
+
+_AT_ONCE = 8
+"""So many pieces are read at once (chosen: of object storage one by one is waiting)."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +41,8 @@ class _Range:
 
     log: StudyLog
     experiment: Experiment  # of the log, with these configurations
-    runs: tuple[int, int]
+    runs: tuple[int, int] | None  # None: no more of this log
     recipes: dict[str, str] = field(default_factory=dict)  # by configuration; none: nothing is kept
-    last: bool = False  # of its log
 
 
 class Gatherer:
@@ -43,23 +51,39 @@ class Gatherer:
     def __init__(self, jobs: int, progress: Progress | None, tables: int, cost: Cost, pieces: Pieces | None) -> None:
         self._jobs, self._progress, self._tables, self._cost, self._pieces = jobs, progress, tables, cost, pieces
         self._done = self._runs = 0  # of the runs of all logs, in all tables
+        self._silent = False  # of what was gathered before
 
-    def of(self, logs: Sequence[StudyLog], experiment: Experiment) -> list[LogTables]:
+    def tables(self, logs: Sequence[StudyLog], experiment: Experiment) -> StudyTables:
+        """None yet, of any log; those that are added can be read again where pieces are kept."""
+        by_name = {log.name: log for log in logs}
+
+        def again(name: str) -> LogTables:
+            silent = copy(self)
+            silent._silent = True
+            (tables,) = silent.each([by_name[name]], experiment)
+            return tables
+
+        of_logs = {id(alone): alone for alone in (of_log(experiment, name) for name in by_name)}.values()
+        way = any(alone.has_way(name) for alone in of_logs for name in alone.configurations)
+        return StudyTables(None if self._pieces is None else again, way=way)
+
+    def each(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[LogTables]:
         """The tables of each log: of all its configurations and runs. A log is in memory while it is its turn."""
-        found: dict[tuple[str, str, tuple[int, int]], LogTables] = {}
-        self._runs = self._tables * len(logs) * experiment.runs
-        plan = (of_range for log in logs for of_range in self._missing(log, experiment, found))
-        whole: dict[str, LogTables] = {}
+        self._runs, found = self._tables * len(logs) * experiment.runs, dict[str, _Found]()
+        kept = self._pieces is not None
+        plan = self._missing(logs, experiment, found) if kept else self._computing(logs, experiment)
         for of_range, tables in self._computed(plan):
             name = of_range.log.name
             if self._pieces is None:
-                whole[name] = tables
+                yield tables
+            elif of_range.runs is None:
+                yield joined(name, [piece for piece in found.pop(name).values() if piece is not None])
             for configuration, made_by in of_range.recipes.items():
                 assert self._pieces is not None
+                assert of_range.runs is not None
                 way = of_range.experiment.has_way(configuration)
                 piece = self._pieces.write(made_by, tables.of(configuration, way=way))
-                found[name, configuration, of_range.runs] = piece
-        return [whole[log.name] if self._pieces is None else self._joined(log, experiment, found) for log in logs]
+                found[name][configuration, of_range.runs] = piece
 
     def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
         """The rows of `exact.parquet` of a log."""
@@ -72,38 +96,61 @@ class Gatherer:
         for name, configuration in alone.configurations.items():
             made_by = recipe(alone, name, log.identity, None)
             piece = self._pieces.read(made_by, log.name, name)
+            self._pieces.found += piece is not None
             if piece is None:
                 mine = alone.model_copy(update={"configurations": {name: configuration}})
                 piece = self._pieces.write(made_by, LogTables(log.name, exact_table(log.replay(), mine)))
             parts.append(piece.rows)
         log.drop()
-        return frame_of(parts)
+        return pa.concat_tables(
+            [one.replace_schema_metadata(None) for one in parts], promote_options="permissive"
+        ).to_pandas()
 
-    def _missing(
-        self, log: StudyLog, experiment: Experiment, found: dict[tuple[str, str, tuple[int, int]], LogTables]
-    ) -> list[_Range]:
-        """What has to be computed of a log; what is there already is put among what is `found`."""
-        alone, facts = of_log(experiment, log.name), log.facts(experiment)
-        if self._pieces is None:
-            return [_Range(log, alone, (0, alone.runs), last=True)]
-        plan: list[_Range] = []
-        for runs in ranges(alone.runs, facts.episodes):
-            missing = {}
-            for name in alone.configurations:
-                made_by = recipe(alone, name, log.identity, runs)
-                piece = self._pieces.read(made_by, log.name, name)
-                if piece is None:
-                    missing[name] = made_by
+    def _computing(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[_Range]:
+        """All runs of each log."""
+        for log in logs:
+            log.facts(experiment)  # while it is there
+            yield _Range(log, alone := of_log(experiment, log.name), (0, alone.runs))
+
+    def _missing(self, logs: Sequence[StudyLog], experiment: Experiment, found: dict[str, _Found]) -> Iterator[_Range]:
+        """What has to be computed of each log, and its end; what is there already is put among what is `found`."""
+        assert self._pieces is not None
+        for log, there in self._read_ahead(logs, experiment):
+            alone, found[log.name] = of_log(experiment, log.name), there
+            if not self._silent:
+                self._pieces.found += sum(piece is not None for piece in there.values())
+            for runs in dict.fromkeys(runs for _, runs in there):
+                names = [name for name in alone.configurations if there[name, runs] is None]
+                if names:
+                    mine = alone.model_copy(update={"configurations": {n: alone.configurations[n] for n in names}})
+                    yield _Range(log, mine, runs, {n: recipe(alone, n, log.identity, runs) for n in names})
                 else:
-                    found[log.name, name, runs] = piece
-            if missing:
-                mine = {name: alone.configurations[name] for name in missing}
-                plan.append(_Range(log, alone.model_copy(update={"configurations": mine}), runs, missing))
-            else:
-                self._went(runs[1] - runs[0])
-        if not plan:
-            log.drop()
-        return [replace(one, last=one is plan[-1]) for one in plan]
+                    self._went(runs[1] - runs[0])
+            yield _Range(log, alone, None)
+
+    def _read_ahead(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[tuple[StudyLog, _Found]]:
+        """The pieces of each log that are there; those of the next log are read meanwhile."""
+        before: tuple[StudyLog, dict[tuple[str, tuple[int, int]], Future[LogTables | None]]] | None = None
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            try:
+                for log in logs:
+                    reading = {key: pool.submit(*of) for key, of in self._wanted(log, experiment)}
+                    before, now = (log, reading), before
+                    if now is not None:
+                        yield now[0], {key: piece.result() for key, piece in now[1].items()}
+                if before is not None:
+                    yield before[0], {key: piece.result() for key, piece in before[1].items()}
+            finally:  # interrupted: what has not begun never does
+                pool.shutdown(cancel_futures=True)
+
+    def _wanted(self, log: StudyLog, experiment: Experiment) -> Iterator[tuple[tuple[str, tuple[int, int]], Any]]:
+        """By configuration and range of runs how a piece of a log is read."""
+        assert self._pieces is not None
+        alone, cut = of_log(experiment, log.name), list(ranges(experiment.runs, log.facts(experiment).episodes))
+        for name in alone.configurations:
+            for runs in cut:
+                made_by = recipe(alone, name, log.identity, runs)
+                yield (name, runs), (self._pieces.read, made_by, log.name, name)
 
     def _computed(self, plan: Iterable[_Range]) -> Iterator[tuple[_Range, LogTables]]:
         """The tables of ranges, one after the other. No log is read before the workers have nearly nothing to do."""
@@ -111,10 +158,13 @@ class Gatherer:
         waiting: deque[tuple[_Range, list[tuple[int, Future[list[Outcome]]]]]] = deque()
         try:
             for of_range in plan:
-                replay, alone = of_range.log.replay(), of_range.experiment
-                cut = blocks(replay, alone, self._jobs, of_range.runs)
-                waiting.append((of_range, [(len(b), pool.submit(outcomes, replay, alone, b)) for b in cut]))
-                while sum(len(parts) for _, parts in waiting) > self._jobs:
+                parts = []
+                if of_range.runs is not None:
+                    replay, alone = of_range.log.replay(), of_range.experiment
+                    cut = blocks(replay, alone, self._jobs, of_range.runs)
+                    parts = [(len(b), pool.submit(outcomes, replay, alone, b)) for b in cut]
+                waiting.append((of_range, parts))
+                while waiting and (not waiting[0][1] or sum(len(parts) for _, parts in waiting) > self._jobs):
                     yield self._ended(*waiting.popleft())
             while waiting:
                 yield self._ended(*waiting.popleft())
@@ -128,39 +178,15 @@ class Gatherer:
         for runs, part in parts:
             made += part.result()
             self._went(runs)
-        if of_range.last:
+        if of_range.runs is None or self._pieces is None:
             of_range.log.drop()
+        if of_range.runs is None:
+            return of_range, LogTables(of_range.log.name, pd.DataFrame())
         self._cost.add(0.0, made)
         names, accuracy = list(of_range.experiment.configurations), of_range.experiment.measure.accuracy
         return of_range, log_tables(of_range.log.name, made, names, accuracy=accuracy)
 
     def _went(self, runs: int) -> None:
         self._done += runs
-        if self._progress is not None:
+        if self._progress is not None and not self._silent:
             self._progress(self._done, self._runs)
-
-    def _joined(
-        self, log: StudyLog, experiment: Experiment, found: dict[tuple[str, str, tuple[int, int]], LogTables]
-    ) -> LogTables:
-        names = of_log(experiment, log.name).configurations
-        cut = list(ranges(experiment.runs, log.facts(experiment).episodes))
-        return joined(log.name, [found[log.name, name, runs] for name in names for runs in cut])
-
-
-def frame_of(rows: Sequence[pd.DataFrame | pa.Table]) -> pd.DataFrame:
-    """Rows of several logs in one table, of the same kinds however they came to be."""
-    arrow = [one for one in rows if isinstance(one, pa.Table)]
-    if len(arrow) < len(rows):
-        return _way_last(pd.concat(rows, ignore_index=True).infer_objects())
-    table = pa.concat_tables([one.replace_schema_metadata(None) for one in arrow], promote_options="permissive")
-    frame = table.to_pandas()
-    if "braking_pass" in frame:
-        frame["braking_pass"] = pd.array(frame["braking_pass"], dtype="boolean")
-    return _way_last(frame)
-
-
-def _way_last(frame: pd.DataFrame) -> pd.DataFrame:
-    """Columns that only some configurations have are in one place, however the tables came together."""
-    if not set(WAY) <= set(frame):
-        return frame
-    return frame[[*(name for name in frame if name not in WAY), *WAY]]

@@ -53,8 +53,8 @@ def ranges(runs: int, episodes: int) -> Iterator[tuple[int, int]]:
 
 
 class Pieces:
-    """What is kept at an address: a folder or a URL. `found`, `computed`: how many so far; `damaged`: those that had to
-    be computed again. Raises InputError, OutputError where nothing can be kept.
+    """What is kept at an address: a folder or a URL. `found`, `computed`: how many of a study; `damaged`: those that
+    had to be computed again. Raises InputError, OutputError where nothing can be kept.
     """
 
     def __init__(self, address: str | Path) -> None:
@@ -68,13 +68,11 @@ class Pieces:
         name = name_of(recipe)
         try:
             content = self.store.read(name)
-            piece = None if content is None else _read(content, self.store, recipe, log, configuration)
+            return None if content is None else _read(content, self.store, recipe, log, configuration)
         except (OSError, ValueError, KeyError, TypeError) as error:  # what Arrow raises derives from these
             said = " ".join(str(error).split())[:120]
             self.damaged.append(f"{self.store.where}/{name}: damaged, computed again ({said})")
             return None
-        self.found += piece is not None
-        return piece
 
     def write(self, recipe: str, piece: LogTables) -> LogTables:
         """Keep a piece. Returns it as it will be read. Raises OutputError."""

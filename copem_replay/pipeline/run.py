@@ -5,27 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
+from copem_replay.metrics.accuracy.statistics import Total
 from copem_replay.metrics.fixed import fixed_in
+from copem_replay.metrics.metric import OwnSums
 from copem_replay.metrics.output_times import OutputTimes
-from copem_replay.metrics.summary import horizon_s, own_sums_of, summary_of
+from copem_replay.metrics.summary import added, horizon_s, own_sums_of, summary_of
 from copem_replay.metrics.tally import tally
-from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, by_log, totals
+from copem_replay.pipeline.accuracy_tables import AccuracyTables, accuracy_tables, bands, by_log, totals
 from copem_replay.pipeline.closed_form import check_exact
 from copem_replay.pipeline.cost import watched
 from copem_replay.pipeline.facts import Facts
-from copem_replay.pipeline.gather import Gatherer, Progress, frame_of
+from copem_replay.pipeline.gather import Gatherer, Progress
 from copem_replay.pipeline.list_rates import ListTimes, together
+from copem_replay.pipeline.log_tables import LogTables
 from copem_replay.pipeline.memory import memory_notes
 from copem_replay.pipeline.notes import study_notes
 from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.study_log import StudyLog
+from copem_replay.pipeline.study_tables import StudyTables
 from copem_replay.pipeline.sweep import Point, points
 
 
@@ -33,18 +38,33 @@ from copem_replay.pipeline.sweep import Point, points
 class Result:
     """What one experiment gave."""
 
-    table: pd.DataFrame  # detections.parquet
+    tables: StudyTables
     summary: pd.DataFrame  # summary.csv
     notes: tuple[str, ...]  # what has to be said, one line each
     replays: tuple[Replay, ...]  # one per log
     horizon_s: float | None
     exact: pd.DataFrame | None = None  # exact.parquet, with `measure: {exact: true}`
-    accuracy: AccuracyTables | None = None  # with `measure: {accuracy: true}`
+    bands: pd.DataFrame | None = None  # bands.csv, with `measure: {accuracy: true}`
     sweep: pd.DataFrame | None = None  # sweep.csv, with `sweep:`
     costs: tuple[str, ...] = ()  # what has to be said on the terminal alone: no two runs take the same time
     tally: pd.DataFrame = field(default_factory=pd.DataFrame)  # tally.parquet
     logs: tuple[StudyLog, ...] = ()
     facts: tuple[Facts, ...] = ()  # of each log
+    same_instants: bool = True  # of lists, in all runs
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The rows of `detections.parquet`, of all logs."""
+        return self.tables.whole
+
+    @property
+    def accuracy(self) -> AccuracyTables | None:
+        """The tables of all logs, with `measure: {accuracy: true}`."""
+        return None if self.bands is None else self.accuracy_of(list(self.tables.each()), self.table)
+
+    def accuracy_of(self, logs: Sequence[LogTables], rows: pd.DataFrame) -> AccuracyTables:
+        """The same of some logs, which have these rows."""
+        return accuracy_tables(logs, rows, same_instants=self.same_instants)
 
 
 def run(
@@ -76,9 +96,8 @@ def run(
 
 def _run(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> Result:
     exact = _exactly(logs, experiment, gatherer)
-    tables = gatherer.of(logs, experiment)
-    table = frame_of([of.rows for of in tables])
-    facts, tallied, of_logs = [log.facts(experiment) for log in logs], tally(table), by_log(tables)
+    of = _gathered(logs, experiment, gatherer)
+    facts, tallied = [log.facts(experiment) for log in logs], of.tally
     horizon = horizon_s(tallied, experiment.measure.horizon_s)
     times = _times(facts, experiment)
     rows, said = summary_of(
@@ -88,10 +107,10 @@ def _run(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -
         seed=experiment.seed,
         horizon_s=horizon,
         exact=exact,
-        accuracy=totals(of_logs),
+        accuracy=totals(of.totals),
         fixed=fixed_in(experiment.as_written()),
         own=experiment.measure.metrics,
-        sums=own_sums_of(table, experiment.measure.metrics),
+        sums=of.sums,
         outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},
@@ -100,13 +119,32 @@ def _run(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -
     recordings = [log.recording for log in logs]
     notes = study_notes(recordings, {log.name: of.oddities for log, of in zip(logs, facts, strict=True)}, experiment)
     sweep = pd.concat(swept, ignore_index=True) if swept else None
-    accuracy = None
-    if experiment.measure.accuracy and len(experiment.configurations):
-        alike = all(of.same_instants for of in facts)
-        accuracy = accuracy_tables(tables, of_logs, table, same_instants=alike)
+    accurate = experiment.measure.accuracy and len(experiment.configurations)
     ready = tuple(log.ready for log in logs if log.ready is not None)
-    result = Result(table, rows, (*notes, *said), ready, horizon, exact, accuracy, sweep)
-    return replace(result, tally=tallied, logs=tuple(logs), facts=tuple(facts))
+    result = Result(of.tables, rows, (*notes, *said), ready, horizon, exact, bands(of.totals) if accurate else None)
+    alike = all(of.same_instants for of in facts)
+    return replace(result, sweep=sweep, tally=tallied, logs=tuple(logs), facts=tuple(facts), same_instants=alike)
+
+
+class _Gathered(NamedTuple):
+    """What the tables of all logs add up to. `sums`: of own metrics."""
+
+    tables: StudyTables
+    tally: pd.DataFrame
+    totals: dict[tuple[str, str], Total]
+    sums: dict[str, dict[str, OwnSums]]
+
+
+def _gathered(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer) -> _Gathered:
+    """Log by log."""
+    tables = gatherer.tables(logs, experiment)
+    tallies, totals, sums = list[pd.DataFrame](), dict[tuple[str, str], Total](), dict[str, dict[str, OwnSums]]()
+    for one in gatherer.each(logs, experiment):
+        rows = tables.add(one)
+        tallies.append(tally(rows))
+        totals |= by_log([one])
+        sums = added(sums, own_sums_of(rows, experiment.measure.metrics))
+    return _Gathered(tables, pd.concat(tallies, ignore_index=True), totals, sums)
 
 
 def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:
@@ -122,16 +160,16 @@ def _at_point(point: Point, logs: Sequence[StudyLog], gatherer: Gatherer, horizo
     experiment = point.experiment
     if not point.same_units:
         logs = [StudyLog(log.recording, experiment, log.pieces) for log in logs]
-    exact, tables = _exactly(logs, experiment, gatherer), gatherer.of(logs, experiment)
+    exact, of = _exactly(logs, experiment, gatherer), _gathered(logs, experiment, gatherer)
     times = _times([log.facts(experiment) for log in logs], experiment)
     rows, _ = summary_of(
-        tally(frame_of([of.rows for of in tables])),
+        of.tally,
         list(experiment.configurations),
         {name: one.rate_hz for name, one in times.items()},
         seed=experiment.seed,
         horizon_s=horizon,
         exact=exact,
-        accuracy=totals(by_log(tables)),
+        accuracy=totals(of.totals),
         fixed=fixed_in(experiment.as_written()),
         conflicts_asked=experiment.measure.conflict is not None,
         links={name: one.links for name, one in times.items() if one.links is not None},

@@ -41,7 +41,7 @@ def shown_runs(experiment: Experiment, result: Result, log: str) -> tuple[ShownR
     """
     asked = experiment.show.asked() if experiment.show is not None else ()
     stems = [STEM if k == 0 else f"{STEM}_{one}" for k, one in enumerate(asked)]
-    part = result.table[result.table["log"] == log]
+    part = result.tables.rows(log)
     return tuple(
         ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_ranked(part, result.horizon_s, one), stem)
         for one, stem in zip(asked, stems, strict=True)

@@ -7,9 +7,11 @@ import platform
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pandas as pd
+import pyarrow as pa
+from pyarrow import parquet
 
 from copem_replay.core.remote import Remote
 from copem_replay.experiment.file import at_place
@@ -61,12 +63,43 @@ def said_of_logs(recordings: Sequence[Recording]) -> list[dict[str, object]]:
 
 def write_parquet(table: Any, path: Path) -> None:
     """A table, of pandas or of Arrow, as Parquet: NaN as null, text as `string` whatever pandas keeps it in."""
-    import pyarrow as pa
-    from pyarrow import parquet
+    with TableFile(path) as file:
+        file.add(table)
 
-    arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
-    fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
-    arrow = arrow.cast(pa.schema(fields, arrow.schema.metadata))
-    with parquet.ParquetWriter(path, arrow.schema, compression="zstd") as writer:
-        for k in range(0, max(len(arrow), 1), ROWS_A_GROUP):  # of one piece each, however the table was put together
-            writer.write_table(arrow.slice(k, ROWS_A_GROUP).combine_chunks(), row_group_size=ROWS_A_GROUP)
+
+class TableFile:
+    """The same part by part: row groups do not depend on how it is cut. Parts have the same columns of one kind."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._writer: parquet.ParquetWriter | None = None
+        self._left: pa.Table | None = None  # less than a group
+        self._written = False  # any group
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._writer is not None and self._left is not None:
+            if error[0] is None and (len(self._left) or not self._written):
+                self._write(self._left)
+            self._writer.close()
+
+    def add(self, table: Any) -> None:
+        """More rows."""
+        arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
+        fields = [pa.field(f.name, pa.string()) if pa.types.is_large_string(f.type) else f for f in arrow.schema]
+        arrow = arrow.cast(pa.schema(fields, arrow.schema.metadata))
+        if self._writer is None:
+            self._writer = parquet.ParquetWriter(self._path, arrow.schema, compression="zstd")
+        if self._left is not None:
+            arrow = pa.concat_tables([self._left, arrow])
+        for k in range(0, whole := len(arrow) // ROWS_A_GROUP * ROWS_A_GROUP, ROWS_A_GROUP):
+            self._write(arrow.slice(k, ROWS_A_GROUP))
+        self._left = arrow.slice(whole)
+
+    def _write(self, rows: pa.Table) -> None:
+        """A row group, of one chunk however the table was put together."""
+        assert self._writer is not None
+        self._writer.write_table(rows.combine_chunks(), row_group_size=ROWS_A_GROUP)
+        self._written = True

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,12 @@ from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.io.together import File, paths_of
-from copem_replay.pipeline.accuracy_tables import AccuracyTables
 from copem_replay.pipeline.run import Result, log_path_of
 from copem_replay.pipeline.selected_runs import ShownRun, one_run, shown_logs, shown_runs
 from copem_replay.pipeline.sweep import resolved
 from copem_replay.results import tables
 from copem_replay.results.belongings import MARK
-from copem_replay.results.contents import log_entries, versions, write_parquet, written_name
+from copem_replay.results.contents import TableFile, log_entries, versions, write_parquet, written_name
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.place import EXPERIMENT, Place, check_inputs, taken
 
@@ -84,9 +84,10 @@ def _files(
 ) -> list[str]:
     """What is going to be in the folder, by names relative to it."""
     files = [EXPERIMENT, MARK, "summary.csv", "logs.csv"]
-    files += _of_logs("detections.parquet", result.table) + _of_logs("tally.parquet", result.tally)
+    files += _named("detections.parquet", result.tables.counts)
+    files += _named("tally.parquet", dict(result.tally["log"].value_counts(sort=False)))
     files += ["exact.parquet"] * (result.exact is not None) + ["sweep.csv"] * (result.sweep is not None)
-    if result.accuracy is not None:
+    if result.bands is not None:
         files += [f"{name}.parquet" for name in _ACCURACY] + ["bands.csv"]
     for log in shown_logs(experiment, result):
         for shown in shown_runs(experiment, result, log):
@@ -95,11 +96,11 @@ def _files(
     return sorted(files)
 
 
-def _of_logs(name: str, table: pd.DataFrame) -> list[str]:
-    """The file of a table, or those of its logs where it has many rows."""
-    if len(table) <= tables.MANY_ROWS:
+def _named(name: str, counts: Mapping[str, int]) -> list[str]:
+    """The file of a table of which each log has so many rows, or those of its logs where it has many."""
+    if sum(counts.values()) <= tables.MANY_ROWS:
         return [name]
-    return [str(tables.file_of(Path(name), str(log))) for log in table["log"].unique()]
+    return [str(tables.file_of(Path(name), log)) for log, count in counts.items() if count]
 
 
 def _target(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
@@ -116,18 +117,12 @@ def _fill(
     for of in _recorded_latencies(data):
         of["file"] = os.path.relpath(of["file"], place.folder)
     (scratch / EXPERIMENT).write_text(dump(data), encoding="utf-8")
-    for table, name in ((result.table, "detections.parquet"), (result.tally, "tally.parquet")):
-        if len(table) <= tables.MANY_ROWS:
-            write_parquet(table, scratch / name)
-        else:
-            (scratch / name).mkdir()
-            for log, part in table.groupby("log", sort=False):
-                write_parquet(part, tables.file_of(scratch / name, str(log)))
+    _write_rows(result, scratch)
     write_csv(result.summary, scratch / "summary.csv")
     if result.exact is not None:
         write_parquet(result.exact, scratch / "exact.parquet")
-    if result.accuracy is not None:
-        _write_accuracy(result.accuracy, scratch)
+    if result.bands is not None:
+        write_csv(result.bands, scratch / "bands.csv")
     if result.sweep is not None:
         write_csv(result.sweep, scratch / "sweep.csv")
     notes = list(result.notes)
@@ -152,14 +147,13 @@ def _recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _logs(folder: Path, result: Result, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
     """The rows of `logs.csv`: what became of each log."""
-    counts = result.table.groupby("log").size()
     rows = [
         {
             "log": log.name,
             "path": _utf8(" + ".join(written_name(one, folder) for one in paths_of(log.recording.place))),
             "sha256": log.digests["sha256"],
             "episodes": facts.episodes,
-            "rows": int(counts.get(log.name, 0)),
+            "rows": result.tables.counts[log.name],
             "state": "done",
         }
         for log, facts in zip(result.logs, result.facts, strict=True)
@@ -182,7 +176,7 @@ def _run_to_export(
     experiment = of_log(experiment, log)
     chosen = experiment.model_copy(update={"configurations": experiment.shown()})
     names = list(chosen.configurations)
-    of_run = (result.table["log"] == log) & (result.table["run"] == shown.run)
+    rows = result.tables.rows(log)
     manifest = {
         "copem_replay": version("copem-replay"),
         "experiment": dump(resolved(experiment).as_written() | {"logs": [log_path_of(recordings, log).name]}),
@@ -195,7 +189,7 @@ def _run_to_export(
         shown,
         one_run(recording, chosen, shown.run, replay),
         experiment.configurations,
-        result.table[of_run & result.table["configuration"].isin(names)],
+        rows[(rows["run"] == shown.run) & rows["configuration"].isin(names)],
         result.summary[result.summary["configuration"].isin(names)],
         manifest,
     )
@@ -239,10 +233,36 @@ def _utf8(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
-def _write_accuracy(accuracy: AccuracyTables, scratch: Path) -> None:
-    for name in _ACCURACY:
-        write_parquet(getattr(accuracy, name), scratch / f"{name}.parquet")
-    write_csv(accuracy.bands, scratch / "bands.csv")
+def _write_rows(result: Result, scratch: Path) -> None:
+    """The tables of logs, of which all or those of one are in memory, and the tally."""
+    with ExitStack() as open_files:
+        files: dict[str, TableFile] = {}
+
+        def add(name: str, table: Any) -> None:
+            if name not in files:
+                files[name] = open_files.enter_context(TableFile(scratch / name))
+            files[name].add(table)
+
+        for rows, of_logs in result.tables.parts():
+            if sum(result.tables.counts.values()) <= tables.MANY_ROWS:
+                add("detections.parquet", rows)
+            else:
+                _write_by_log(rows, scratch / "detections.parquet")
+            if result.bands is not None:
+                accuracy = result.accuracy_of(of_logs, rows)
+                for name in _ACCURACY:
+                    add(f"{name}.parquet", getattr(accuracy, name))
+    if len(result.tally) <= tables.MANY_ROWS:
+        write_parquet(result.tally, scratch / "tally.parquet")
+    else:
+        _write_by_log(result.tally, scratch / "tally.parquet")
+
+
+def _write_by_log(rows: pd.DataFrame, folder: Path) -> None:
+    """A file for each log."""
+    folder.mkdir(exist_ok=True)
+    for log, part in rows.groupby("log", sort=False):
+        write_parquet(part, tables.file_of(folder, str(log)))
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:

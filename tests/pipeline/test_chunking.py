@@ -80,11 +80,11 @@ def assert_same(whole: Result, pieces: Result) -> None:
         pd.testing.assert_frame_equal(whole.sweep, pieces.sweep, check_exact=True)
     assert whole.accuracy is not None
     assert pieces.accuracy is not None
+    pd.testing.assert_frame_equal(whole.bands, pieces.bands, check_exact=True)
     assert_same_tables(whole.accuracy, pieces.accuracy)
 
 
 def assert_same_tables(whole: AccuracyTables, pieces: AccuracyTables) -> None:
-    pd.testing.assert_frame_equal(whole.bands, pieces.bands, check_exact=True)
     for name in ("accuracy", "instants", "lists", "thresholds"):
         mine, theirs = getattr(whole, name), getattr(pieces, name)
         assert (mine is None) == (theirs is None)

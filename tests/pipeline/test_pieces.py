@@ -11,7 +11,11 @@ import pytest
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.experiment import validate
+from copem_replay.pipeline import study_tables
+from copem_replay.pipeline.log_tables import LogTables
 from copem_replay.pipeline.pieces import ranges
+from copem_replay.pipeline.study_tables import StudyTables
+from copem_replay.results import contents, tables
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive
 
@@ -42,7 +46,7 @@ def replayed(text: str, out: str, kept: str | None = "kept") -> tuple[dict[str, 
     result.save(out, overwrite=True)
     store = result.replayed.logs[0].pieces
     counts = (0, 0) if store is None else (store.computed, store.found)
-    files = {path.name: path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
+    files = {str(path.relative_to(out)): path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
     return {name: content for name, content in files.items() if not name.endswith(".rrd")}, *counts
 
 
@@ -126,7 +130,7 @@ def test_a_log_that_is_shown_is_read_again_and_no_other(here: Path, monkeypatch:
     again, _, _ = replayed(text, "again")
     assert names == ["b"]
     assert again == first
-    assert "b.mcap" in again
+    assert "replay/b.mcap" in again
 
 
 def test_what_is_damaged_is_computed_again(here: Path) -> None:
@@ -204,3 +208,33 @@ def test_a_long_log_in_stretches_has_the_pieces_of_each_configuration_alone(
         assert replayed("\n".join(alone), "alone")[1:] == (2, 0)
     again, computed, found = replayed(text, "again")
     assert (computed, found, again) == (2, 2 * 3, plain)
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["one file", "a file per log"])
+@pytest.mark.parametrize(
+    "text", [study(LINKS, gnn=True).replace("measure:", RADIO), study(FLEET, "sweep: {penetration_rate: [0, 0.3]}")]
+)
+def test_rows_of_one_log_are_in_memory_at_a_time(
+    text: str, many: bool, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where rows are too many they are read again to be written: the same bytes, of row groups, too."""
+    monkeypatch.setattr(contents, "ROWS_A_GROUP", 100)
+    if many:
+        monkeypatch.setattr(tables, "MANY_ROWS", 10)
+    for name in "cd":
+        (here / f"{name}.mcap").hardlink_to("a.mcap")
+    text = text.replace("logs: [a.mcap, b.mcap]", "logs: ['?.mcap']")
+    plain, _, _ = replayed(text, "plain", None)
+    assert len([name for name in plain if name.startswith("detections.parquet")]) == (4 if many else 1)
+    monkeypatch.setattr(study_tables, "HELD_ROWS", 100)
+    held: list[int] = []
+    of = StudyTables._of
+
+    def watched(self: StudyTables, log: str) -> LogTables:
+        held.append(len(self._held))
+        return of(self, log)
+
+    monkeypatch.setattr(StudyTables, "_of", watched)
+    first, computed, _ = replayed(text, "first")
+    assert (first, max(held)) == (plain, 0)
+    assert replayed(text, "again") == (plain, 0, computed)

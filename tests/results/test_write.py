@@ -21,9 +21,11 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.write.mcap import RUN_RECORD
 from copem_replay.pipeline import blocks as blocks_module
+from copem_replay.pipeline.log_tables import LogTables
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.run import Result, run
 from copem_replay.pipeline.selected_runs import shown_logs, shown_runs
+from copem_replay.pipeline.study_tables import StudyTables
 from copem_replay.results import tables as result_tables
 from copem_replay.results.export import Exporter, RunToExport
 from copem_replay.results.write import write_results
@@ -243,8 +245,13 @@ def made_up(times: list[float | None]) -> Result:
     """A result of one log with these times to detection, run by run; the horizon is 9 s."""
     of = {"log": "scene", "configuration": "PEM", "object_id": "a"}
     table = pd.DataFrame({**of, "run": range(len(times)), "time_to_detection_s": times})
-    ready = prepare(scenes.oncoming_car(), experiment())
-    return Result(table, pd.DataFrame(), (), (ready,), 9.0)
+    return Result(of_one_log(table), pd.DataFrame(), (), (prepare(scenes.oncoming_car(), experiment()),), 9.0)
+
+
+def of_one_log(rows: pd.DataFrame) -> StudyTables:
+    tables = StudyTables()
+    tables.add(LogTables("scene", rows))
+    return tables
 
 
 @pytest.mark.parametrize(
@@ -277,7 +284,7 @@ def test_several_runs_are_shown_each_as_it_was_asked_for() -> None:
         for k, of_run in enumerate(times)
         for n, (name, one) in enumerate(keys)
     ]
-    result = dataclasses.replace(made_up([]), table=pd.DataFrame(rows))
+    result = dataclasses.replace(made_up([]), tables=of_one_log(pd.DataFrame(rows)))
     shown = shown_runs(experiment(show={"run": ["median", "worst", 0, "best"]}, runs=4), result, "scene")
     over = "of 4 by time to detection summed over 2 configurations and 2 objects, the first of 2 equal"
     assert [(one.run, one.why, one.stem) for one in shown] == [

@@ -86,7 +86,7 @@ class StudyResult:
     @property
     def bands(self) -> pd.DataFrame | None:
         """Accuracy by configuration and by distance, time or existence."""
-        return None if self.replayed.accuracy is None else self.replayed.accuracy.bands
+        return self.replayed.bands
 
     @property
     def notes(self) -> tuple[str, ...]:
