@@ -68,3 +68,8 @@ def source_of(folder: Path, text: str) -> Source:
     path = folder / "experiment.yaml"
     path.write_text(text, encoding="utf-8")
     return load(path)
+
+
+def files(folder: str) -> dict[str, bytes]:
+    """All files of a folder, by their paths in it."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}

@@ -5,20 +5,24 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import dask
+import pandas as pd
 import pytest
 
+from copem_replay.cli import main as cli
 from copem_replay.core.errors import CopemError, InputError
 from copem_replay.pipeline.crew import dask_workers, worker
 from copem_replay.pipeline.crew.crew import TaskFailedError
 from copem_replay.pipeline.crew.dask_workers import DaskWorkers
 from copem_replay.pipeline.pieces import Pieces
 from tests.cli.test_api import cr
-from tests.helpers.experiments import changed, drive
+from tests.helpers.experiments import changed, drive, files
 from tests.helpers.object_storage import Bucket
 from tests.helpers.recordings import Obj, write_recording
 from tests.pipeline.test_pieces import EXACT, FLEET, study
@@ -68,8 +72,7 @@ def replayed(text: str, out: str, **keys: Any) -> tuple[dict[str, bytes], int, i
     result = cr.run("e.yaml", **keys)
     result.save(out, overwrite=True)
     store = result.replayed.logs[0].pieces
-    files = {str(p.relative_to(out)): p.read_bytes() for p in Path(out).rglob("*") if p.is_file()}
-    return files, *((0, 0) if store is None else (store.computed, store.found))
+    return files(out), *((0, 0) if store is None else (store.computed, store.found))
 
 
 class Shuffled(Executor):
@@ -136,7 +139,10 @@ def at_45_m_and_a_half(kind: str, **keys: Any) -> str:
     write_recording(Path("at45.mcap"), frames, host=1)
     said = "".join(f", {name}: {value!r}" for name, value in keys.items())
     model = f"{{kind: 'tests.helpers.bad_models:{kind}', spare: {os.getpid()}{said}}}"
-    return changed("logs: ['*.mcap']").replace("{kind: constant, probability: 0.5}", model)
+    text = changed("logs: ['*.mcap']")
+    if kind == "DeadlyFusion":
+        return text.replace("latency_s: 0.5", f"fusion: {model}")
+    return text.replace("{kind: constant, probability: 0.5}", model)
 
 
 def test_the_same_bytes_where_workers_are_killed(connected: Callable[..., DaskWorkers]) -> None:
@@ -170,6 +176,26 @@ def test_a_log_that_workers_die_of_is_named_and_the_others_are_done(connected: C
     assert surveyed == 2
     assert replayed(others, "out", pieces="kept", crew=workers)[0] == plain
     assert len(list(Path("kept/logs").iterdir())) == surveyed
+
+
+def test_a_log_that_workers_die_of_is_skipped_where_that_is_asked_for(
+    cluster: Any, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Here they die when it is replayed, and have surveyed it before."""
+    text = at_45_m_and_a_half("DeadlyFusion")
+    plain, _, _ = replayed(text.replace("'*.mcap'", "a.mcap, b.mcap"), "plain")
+    Path("e.yaml").write_text(text)
+    command = f"copem-replay run e.yaml --skip-unreadable --out out --cluster {cluster.scheduler_address}"
+    monkeypatch.setattr("sys.argv", command.split())
+    assert cli._ended() == 1
+    why = "the worker that replayed it died 3 times (out of memory?)"
+    assert f"note: at45.mcap: skipped: {why}" in capsys.readouterr().err.splitlines()
+    rows = pd.read_csv("out/logs.csv", keep_default_na=False)[["path", "state", "reason"]].to_numpy().tolist()
+    assert rows == [["../a.mcap", "done", ""], ["../b.mcap", "done", ""], ["../at45.mcap", "skipped", why]]
+    assert len(list(Path("out.pieces/logs").iterdir())) == 3
+    found = files("out")
+    assert {name for name in plain if found.pop(name) != plain[name]} == {"logs.csv", "provenance.json"}
+    assert found == {}
 
 
 def test_a_dead_pool_is_said_and_what_is_done_stays(here: Path) -> None:
@@ -248,6 +274,8 @@ def _blind(expected: dict[str, str], pieces: str, folder: str, token: str) -> tu
             r"^--cluster: expected local, local:N, tcp://HOST:PORT, tls://HOST:PORT or .*\(.json\), found 'here'$",
         ),
         ("local:0", r"^--cluster: expected local"),
+        ("tcp://", r"^--cluster: expected local"),
+        ("tls://127.0.0.1:port", r"^--cluster: expected local"),
     ],
 )
 def test_addresses(address: str, words: str) -> None:
@@ -258,6 +286,42 @@ def test_addresses(address: str, words: str) -> None:
 def test_a_scheduler_that_is_not_there(here: Path) -> None:
     with pytest.raises(CopemError, match=r"^--cluster: tcp://127.0.0.1:1: no scheduler answers there \("):
         DaskWorkers("tcp://127.0.0.1:1", Pieces("kept"), 0, wait_s=0.1)
+
+
+def test_a_scheduler_file_that_is_not_there_and_one_that_comes(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = (
+        r"^--cluster: s.json: no scheduler answers there \(expected the file of `dask scheduler --scheduler-file`, fo"
+    )
+    with pytest.raises(CopemError, match=words):
+        DaskWorkers("s.json", Pieces("kept"), 0, wait_s=0)
+    contents = ["", "{", '{"address": "tcp://127.0.0.1:1"}']
+    monkeypatch.setattr(time, "sleep", lambda _: Path("s.json").write_text(contents.pop(0)))
+    assert dask_workers._address_in(Path("s.json"), time.monotonic() + 60) == "tcp://127.0.0.1:1"
+
+
+@pytest.mark.parametrize(
+    ("authority", "own", "found"),
+    [(None, None, "none"), ("own.pem", None, "none"), ("no.pem", "own.pem", "[Errno 2] No such file or directory")],
+)
+def test_certificates_that_are_not_there(
+    authority: str | None,
+    own: str | None,
+    found: str,
+    here: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Said at once; also where a scheduler file says so."""
+    Path("e.yaml").write_text(study())
+    Path("s.json").write_text('{"address": "tls://127.0.0.1:1"}')
+    settings = {"distributed.comm.tls.ca-file": authority, "distributed.comm.tls.client.cert": own}
+    out = "set DASK_DISTRIBUTED__COMM__TLS__CA_FILE and DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT"
+    for address in ("tls://127.0.0.1:1", "s.json"):
+        monkeypatch.setattr("sys.argv", f"copem-replay run e.yaml --cluster {address}".split())
+        with dask.config.set(settings):
+            assert cli._ended() == 2
+        said = f"--cluster: {address}: expected certificates in Dask's settings, found {found}; {out}\n"
+        assert capsys.readouterr().err == said
 
 
 def test_what_a_crew_needs(here: Path) -> None:

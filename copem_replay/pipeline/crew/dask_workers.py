@@ -5,6 +5,7 @@ Dask unpickles what it is sent, on both sides: a scheduler is trusted as one's o
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import platform
@@ -34,7 +35,11 @@ WAIT_S = 600.0
 _ANSWERS_S = 10.0
 _LOOKS = 1000
 """Among so many tasks one is looked for whose log a worker has in memory (chosen)."""
+_STARTS_S = 60.0
+"""So long a scheduler file is waited for: the line before may be starting it (chosen)."""
 _LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
+_ADDRESS = re.compile(r"(tcp|tls)://[^/\s]+:[1-9][0-9]{0,4}")
+_TLS = "DASK_DISTRIBUTED__COMM__TLS__"
 _PROBE = "probe.txt"
 _GONE = (OSError, RuntimeError)
 """The scheduler does not answer (a TimeoutError is an OSError), or the client has closed itself for that."""
@@ -42,11 +47,7 @@ _GONE = (OSError, RuntimeError)
 
 def check_address(address: str) -> None:
     """Raises InputError where an address is none, or Dask is not installed."""
-    if (
-        not _LOCAL.fullmatch(address)
-        and not address.startswith(("tcp://", "tls://"))
-        and Path(address).suffix != ".json"
-    ):
+    if not _LOCAL.fullmatch(address) and not _ADDRESS.fullmatch(address) and Path(address).suffix != ".json":
         expected = "local, local:N, tcp://HOST:PORT, tls://HOST:PORT or a scheduler file (.json)"
         raise InputError(f"--cluster: expected {expected}, found {address!r}")
     try:
@@ -71,8 +72,9 @@ class DaskWorkers(Workers):
         logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)  # what matters is said in our own words
         self._cluster = _local(int(address.partition(":")[2] or cores)) if _LOCAL.fullmatch(address) else None
         try:
-            self._client = self._connected(min(self._wait_s, _ANSWERS_S))
-        except (OSError, ValueError, TypeError) as error:  # nobody there; no address; tls:// without certificates
+            answers_s = _STARTS_S if Path(address).suffix == ".json" else _ANSWERS_S
+            self._client = self._connected(min(self._wait_s, answers_s))
+        except (OSError, ValueError) as error:  # nobody there; no address in the file
             raise CopemError(f"--cluster: {address}: no scheduler answers there ({_in_a_line(error)})") from None
         try:
             self._begin(time.monotonic() + self._wait_s)
@@ -143,15 +145,19 @@ class DaskWorkers(Workers):
             self._unwanted.pop().cancel()
 
     def _connected(self, timeout_s: float) -> Any:
-        """Raises OSError: nobody answers."""
+        """Raises OSError: nobody answers; InputError: tls:// without certificates."""
         import distributed
 
-        where: dict[str, Any] = {"address": self._cluster or self.address}
+        where = self._cluster or self.address
         if Path(self.address).suffix == ".json":
-            where = {"scheduler_file": self.address}
+            until_s = time.monotonic() + timeout_s
+            where = _address_in(Path(self.address), until_s)
+            timeout_s = max(until_s - time.monotonic(), 1)
+        if f"{where}".startswith("tls://"):
+            _check_certificates(self.address)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of versions, which are compared more closely
-            return distributed.Client(**where, timeout=timeout_s, set_as_default=False)
+            return distributed.Client(where, timeout=timeout_s, set_as_default=False)
 
     def _begin(self, until_s: float) -> None:
         """Wait for a worker, and look at all there are. Raises TimeoutError, CopemError."""
@@ -233,6 +239,30 @@ def _unlike(worker: str, said: tuple[str, str | None, bool] | Exception) -> str:
     if isinstance(said, Exception):  # it has not even the same modules
         return f"{worker} has no such copem-replay as here ({_in_a_line(said)})"
     return f"{said[0]} {said[1]}" if said[1] else ""
+
+
+def _address_in(file: Path, until_s: float) -> str:
+    """The address in a scheduler file, when it is written. Raises TimeoutError."""
+    while True:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            return str(json.loads(file.read_bytes())["address"])
+        if time.monotonic() > until_s:
+            raise TimeoutError("expected the file of `dask scheduler --scheduler-file`, found none")
+        time.sleep(0.1)
+
+
+def _check_certificates(address: str) -> None:
+    """Raises InputError where there are none for tls://: a client that cannot begin ends 20 s later in a traceback."""
+    import distributed
+
+    try:
+        there = distributed.Security().get_connection_args("client")["ssl_context"]
+        found = "none" if there is None else ""
+    except OSError as error:  # no such file, or not a certificate with its key (ssl.SSLError)
+        found = _in_a_line(error)
+    if found:
+        out = f"set {_TLS}CA_FILE and {_TLS}CLIENT__CERT"
+        raise InputError(f"--cluster: {address}: expected certificates in Dask's settings, found {found}; {out}")
 
 
 def _local(count: int) -> Any:
