@@ -1,8 +1,7 @@
-"""Schedulers and workers as users start them, on 127.0.0.1: what docs/guide/scale.md says to type."""
+"""Schedulers and workers as users start them, on 127.0.0.1, and what becomes of them."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -17,7 +16,7 @@ from copem_replay.core.errors import CopemError
 from copem_replay.pipeline.crew.dask_workers import DaskWorkers
 from copem_replay.pipeline.pieces import Pieces
 from tests.cli.test_api import cr
-from tests.helpers.experiments import changed, drive
+from tests.helpers.experiments import changed, drive, files
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
@@ -64,23 +63,6 @@ def scheduler(start: Start, port: int = 0) -> tuple[subprocess.Popen[str], str]:
     assert process.stderr is not None
     found = (re.search(r"Scheduler at: +(tcp://[0-9.:]+)", line) for line in process.stderr)
     return process, next(one[1] for one in found if one is not None)
-
-
-def files(out: str) -> dict[str, bytes]:
-    return {str(path.relative_to(out)): path.read_bytes() for path in Path(out).rglob("*") if path.is_file()}
-
-
-@pytest.mark.long
-def test_commands_of_the_guide(here: Path, start: Start) -> None:
-    cr.run("e.yaml").save("plain")
-    scheduler(start)
-    start("dask worker --scheduler-file scheduler.json --nworkers 2 --nthreads 1 --host 127.0.0.1 --no-dashboard")
-    command = [BIN / "copem-replay", "run", "e.yaml", "--cluster", "scheduler.json", "--out", "study"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert ended.returncode == 0, ended.stderr
-    assert ended.stderr == "pieces: 18 computed, 0 found in study.pieces\n"
-    assert json.loads(Path("scheduler.json").read_text())["address"].startswith("tcp://127.0.0.1:")
-    assert files("study") == files("plain")
 
 
 @pytest.mark.long
