@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 FAR_M = 2000.0
 """A place farther away from all objects is taken for a mistake (chosen: no sensor beside a road sees so far)."""
 
+_NAMED = 3  # of the logs of which the same is said, so many are named (chosen)
 _ROWS = 500_000  # object states looked at in one piece (chosen: some ten MB)
 _SAMPLE = 16  # one in so many is looked at first (chosen)
 
@@ -51,13 +52,29 @@ def study_notes(
     recordings: Sequence[Recording], oddities_of: Mapping[str, Iterable[str]], experiment: Experiment
 ) -> list[str]:
     """The same, with what is odd about each log."""
-    notes = [f"{recording.scene.log}: {note}" for recording in recordings for note in recording.notes]
-    notes += [f"{log}: {note}" for log, odd in oddities_of.items() for note in odd]
+    notes = _by_log((recording.scene.log, note) for recording in recordings for note in recording.notes)
+    notes += _by_log((log, note) for log, odd in oddities_of.items() for note in odd)
     notes += settings_notes(experiment)
     notes += without_points(experiment)
     notes += _remembered_in_vain(experiment)
     notes += notes_on_outputs(experiment)
     return notes
+
+
+def _by_log(said: Iterable[tuple[str, str]]) -> list[str]:
+    """A line for each log and what is said of it; one line for what is said of more than three."""
+    pairs = list(dict.fromkeys(said))
+    whose: dict[str, list[str]] = {}
+    for log, note in pairs:
+        whose.setdefault(note, []).append(log)
+    lines = []
+    for log, note in pairs:
+        first, more = whose[note][:_NAMED], len(whose[note]) - _NAMED
+        if more <= 0:
+            lines.append(f"{log}: {note}")
+        elif log == first[0]:
+            lines.append(f"{', '.join(first)} and {counted(more, 'other log')}: {note}")
+    return lines
 
 
 def _remembered_in_vain(experiment: Experiment) -> Iterator[str]:

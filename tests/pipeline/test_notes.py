@@ -91,6 +91,18 @@ def test_check_says_it_as_run_does(here: Path, change: str, said: list[str]) -> 
     assert after(here, changed(change)) == said
 
 
+def test_what_is_said_of_many_logs_is_one_line(here: Path) -> None:
+    """Of four names of a drive, and of three: there each has its line."""
+    for name in "ace":
+        (here / f"{name}.mcap").hardlink_to(here / "drive.mcap")
+    text = changed("logs: ['*.mcap']", couple("{range_m: [0, 5]}"))
+    said = [f"a, c, drive and 1 other log: unit {unit}: {UNMET}" for unit in ("ego", "mast")]
+    assert before(here, text) == after(here, text) == said
+    (here / "e.mcap").unlink()
+    each = [f"{log}: unit {unit}: {UNMET}" for log in ("a", "c", "drive") for unit in ("ego", "mast")]
+    assert before(here, text) == after(here, text) == each
+
+
 @pytest.mark.parametrize("rows", [1, 7, 1000])
 @pytest.mark.parametrize("sample", [1, 5, 1000])
 @pytest.mark.parametrize("rate", ["", ", rate_hz: 10"])
