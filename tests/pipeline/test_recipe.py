@@ -95,7 +95,7 @@ def test_every_key_changes_the_piece_or_is_said_not_to() -> None:
     for path, changed in variants(experiment()):
         assert isinstance(changed, Experiment)
         if path.endswith(".recorded"):
-            continue  # a unit's: without its pem; a configuration's: see below
+            continue  # a unit's: without its pem, see the next test; a configuration's: see below
         if path == "configurations.mine.units":
             changed = experiment(configurations={"mine": DATA["configurations"]["mine"] | {"units": ["ego"]}})
         elif path == "configurations.mine.inputs":  # of a recorded output, which has nothing else
@@ -114,6 +114,13 @@ def test_every_key_changes_the_piece_or_is_said_not_to() -> None:
         seen.add(path)
     assert len(seen) > 100
     assert {*UNTOUCHED, "configurations", "units", "pems", "links"} == set(NOT_OF_A_PIECE)
+
+
+def test_every_key_of_recorded_lists_changes_the_piece() -> None:
+    recorded = experiment(units=DATA["units"] | {"mast": {"on": "2", "recorded": {"topic": "/lists"}}})
+    keys = {path: key(one) for path, one in variants(recorded) if path.startswith("units.mast.recorded.")}
+    assert len(keys) > 3
+    assert key(experiment()) != key(recorded) not in keys.values()
 
 
 def models() -> list[type[BaseModel]]:

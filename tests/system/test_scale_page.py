@@ -27,6 +27,7 @@ from copem_replay.pipeline.crew import dask_workers
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
 from tests.helpers.page import blocks, spans
+from tests.viewer.test_rrd import rerun
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/guide/scale.md"
@@ -108,21 +109,25 @@ def test_pieces_are_found_again_and_removed(here: Path) -> None:
     assert files("out/dask") == files("out/plain")
 
 
-def test_a_process_per_core(here: Path) -> None:
+@pytest.mark.parametrize(("more", "processes"), [("", 2), (":1", 1), (":3", 3)], ids=["local", "local:1", "local:3"])
+def test_as_many_processes_as_are_said(
+    more: str, processes: int, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One per core as the page has it. What is shown is the same, too."""
+    Path("study.yaml").write_text(changed("logs: [drives/**/*.mcap]", "show: {run: worst, logs: [b]}"))
+    cr.run("study.yaml").save("out/shown")
     _, command = block("--cluster local").splitlines()
-    assert COMPUTED.format("out") in typed(command, here).splitlines()
-    assert files("out/study") == files("out/plain")
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_as_many_processes_as_are_said(count: int, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, command = block("--cluster local").splitlines()
-    monkeypatch.setattr("sys.argv", [*shlex.split(command)[:-1], f"local:{count}"])
+    monkeypatch.setattr("sys.argv", shlex.split(command + more))
     begun, local = [], dask_workers._local
     monkeypatch.setattr(dask_workers, "_local", lambda workers: begun.append(workers) or local(workers))
     assert cli._ended() == 0
-    assert begun == [count]
-    assert files("out/study") == files("out/plain")
+    assert begun == [processes]
+    assert COMPUTED.format("out") in capsys.readouterr().err.splitlines()
+    found, expected = files("out/study"), files("out/shown")
+    (shown,) = [name for name in expected if name.endswith(".rrd")]
+    assert rerun("rrd", "compare", "--unordered", f"out/study/{shown}", f"out/shown/{shown}").returncode == 0
+    del found[shown], expected[shown]
+    assert found == expected
 
 
 def test_packages_are_those_of_the_project(here: Path) -> None:
