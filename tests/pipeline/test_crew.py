@@ -140,7 +140,7 @@ def at_45_m_and_a_half(kind: str, **keys: Any) -> str:
     said = "".join(f", {name}: {value!r}" for name, value in keys.items())
     model = f"{{kind: 'tests.helpers.bad_models:{kind}', spare: {os.getpid()}{said}}}"
     text = changed("logs: ['*.mcap']")
-    if kind == "DeadlyFusion":
+    if kind.endswith("Fusion"):
         return text.replace("latency_s: 0.5", f"fusion: {model}")
     return text.replace("{kind: constant, probability: 0.5}", model)
 

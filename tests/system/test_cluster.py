@@ -17,6 +17,7 @@ from copem_replay.pipeline.crew.dask_workers import DaskWorkers
 from copem_replay.pipeline.pieces import Pieces
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
+from tests.pipeline.test_crew import at_45_m_and_a_half
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
@@ -127,6 +128,25 @@ def test_an_interrupt_ends_all_and_says_what_is_done(number: int, code: int, her
     _, said = command.communicate(timeout=60)  # until the last of its processes has closed the pipe
     assert command.returncode == code
     assert said == "interrupted; 0 of 6 logs are in out/e.pieces\n"
+
+
+def test_a_command_that_is_killed_goes_on_with_what_is_missing(here: Path, start: Start) -> None:
+    """Its one worker, which ends with it, has done the first of seven logs and halts in the second."""
+    os.mkfifo("said")
+    Path("e.yaml").write_text(at_45_m_and_a_half("HaltingFusion", said="said"))  # not in this process
+    cr.run("e.yaml").save("out/plain")
+    command = start("copem-replay run e.yaml --cluster local:1")
+    with open("said", "rb") as file:
+        assert file.read(1) == b"."
+    command.kill()
+    command.communicate(timeout=60)  # until its worker has closed the pipe
+    assert len([*Path("out/e.pieces/pieces").glob("*/[!.]*.sums.parquet")]) == 3
+    result = cr.run("e.yaml", pieces="out/e.pieces")
+    result.save("out/again")
+    pieces = result.replayed.logs[0].pieces
+    assert pieces is not None
+    assert (pieces.computed, pieces.found) == (18, 3)
+    assert files("out/again") == files("out/plain")
 
 
 def inodes(leader: int) -> Iterator[str]:
