@@ -324,6 +324,20 @@ def test_certificates_that_are_not_there(
         assert capsys.readouterr().err == said
 
 
+def test_a_client_that_has_closed_itself_gives_up_its_tasks(connected: Callable[..., DaskWorkers]) -> None:
+    """As it does where the scheduler is gone for longer than it looks for it; then there is a new one."""
+    plain, computed, _ = replayed(study(), "plain", pieces="alone")
+    workers, closed = connected(), list[bool]()
+
+    def close(done: int, total: int) -> None:
+        if done and not closed:
+            closed.append(True)
+            workers._client.close()
+
+    assert replayed(study(), "dask", pieces="kept", crew=workers, progress=close) == (plain, computed, 0)
+    assert closed
+
+
 def test_what_a_crew_needs(here: Path) -> None:
     Path("e.yaml").write_text(study())
     with ThreadPoolExecutor(1) as pool:

@@ -94,7 +94,7 @@ def test_a_scheduler_that_does_not_come_back(here: Path, start: Start) -> None:
     first, address = scheduler(start)
     start(f"dask worker {address} --nworkers 1 --nthreads 1 --host 127.0.0.1 --no-dashboard")
     workers = DaskWorkers(address, Pieces("kept"), 0)
-    workers._wait_s = 0.5
+    workers._wait_s = workers._client._timeout = 0.5  # the client first looks for it, then we
 
     def kill(done: int, total: int) -> None:
         if done and first.poll() is None:

@@ -113,7 +113,14 @@ class DaskWorkers(Workers):
         mine: Future[Receipt] = Future()
         key = f"copem-{secrets.token_hex(8)}"
         self._given[key] = mine, len(task.keys)
-        given = self._client.submit(_done_at, task, key=key, pure=False)
+        try:
+            given = self._client.submit(_done_at, task, key=key, pure=False)
+        except Exception:
+            if self._client.status != "closed":
+                raise
+            del self._given[key]
+            _given_up(mine)
+            return mine
         mine.add_done_callback(lambda _: self._let_go(key, given))
         given.add_done_callback(lambda _: self._landed(task, given, mine))
         return mine
@@ -142,7 +149,8 @@ class DaskWorkers(Workers):
     def _forget(self) -> None:
         """Tell Dask of the tasks that nobody waits for any more."""
         while self._unwanted:
-            self._unwanted.pop().cancel()
+            with suppress(Exception):  # a client that has closed itself has no tasks, and errors of its own
+                self._unwanted.pop().cancel()
 
     def _connected(self, timeout_s: float) -> Any:
         """Raises OSError: nobody answers; InputError: tls:// without certificates."""
@@ -205,8 +213,7 @@ class DaskWorkers(Workers):
                 self._idle.append(at)
                 mine.set_result(receipt)
             except (CancelledError, OSError):  # the scheduler is gone
-                if mine.cancel():
-                    mine.set_running_or_notify_cancel()
+                _given_up(mine)
             except Exception as error:
                 mine.set_exception(error)
 
@@ -221,6 +228,12 @@ def _done_at(task: Task) -> tuple[str, Receipt]:
     from distributed import get_worker
 
     return get_worker().address, done(task)
+
+
+def _given_up(mine: Future[Receipt]) -> None:
+    """As who had it is gone."""
+    if mine.cancel():
+        mine.set_running_or_notify_cancel()
 
 
 def greeting(expected: dict[str, str], pieces: str, folder: str, token: str) -> tuple[str, str | None, bool]:
