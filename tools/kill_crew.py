@@ -2,8 +2,9 @@
 
     python tools/kill_crew.py --kills 20
 
-Half are workers of `--cluster local:2`: the results are the same bytes, each time. Half are the command itself, as
-`kill -9` does: its workers end, and the same command computes what was missing and nothing else, to the same bytes.
+First so many workers of `--cluster local:2`: the results are the same bytes, each time. Then so many commands, as
+`kill -9` does, when a random number of pieces is there: their workers end, and the same command computes what was
+missing and nothing else, to the same bytes.
 """
 
 from __future__ import annotations
@@ -72,7 +73,9 @@ def kill_commands(kills: int, rng: random.Random, expected: dict[str, bytes], wh
     for k in range(kills):
         command = [*TOOL, "run", "e.yaml", "--out", "out", "--overwrite", "--pieces", f"command{k}"]
         began = subprocess.Popen([*command, "--cluster", "local:2"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        time.sleep(rng.uniform(1, 15))
+        enough = rng.randrange(whole)
+        while began.poll() is None and len(pieces(f"command{k}")) <= enough:
+            time.sleep(0.01)
         unscathed += began.poll() is not None
         began.kill()
         began.communicate()  # until its workers have ended, too
@@ -106,8 +109,8 @@ def main() -> None:
         Path("e.yaml").write_text(changed("logs: ['*.mcap']", "runs: 300"))
         cr.run("e.yaml", pieces="plain").save("out")
         expected, whole = files("out"), len(pieces("plain"))
-        wrong = kill_workers(arguments.kills - arguments.kills // 2, rng, expected)
-        wrong += kill_commands(arguments.kills // 2, rng, expected, whole)
+        wrong = kill_workers(arguments.kills, rng, expected)
+        wrong += kill_commands(arguments.kills, rng, expected, whole)
         os.chdir(ROOT)
     print("\n".join([*wrong, f"wrong: {len(wrong)}"]))
     sys.exit(bool(wrong))

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
@@ -20,6 +21,7 @@ from copem_replay.core.errors import CopemError, InputError
 from copem_replay.pipeline.crew import dask_workers, worker
 from copem_replay.pipeline.crew.crew import TaskFailedError
 from copem_replay.pipeline.crew.dask_workers import DaskWorkers
+from copem_replay.pipeline.crew.task import LogTask, Task
 from copem_replay.pipeline.pieces import Pieces
 from tests.cli.test_api import cr
 from tests.helpers.experiments import changed, drive, files
@@ -124,6 +126,37 @@ def test_recordings_and_pieces_under_urls_by_a_pool_of_processes(here: Path, buc
         kept = f"{bucket.url}/kept"
         assert replayed(text, "pool", pieces=kept, crew=pool) == (plain, 2 * 3 * 2, 0)
         assert replayed(text, "again", pieces=kept, crew=pool) == (plain, 0, 2 * 3 * 2)
+
+
+def test_a_log_is_read_once_to_be_surveyed_and_replayed(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And again where it was let go of, where its file is another, and where something else of it is to be known."""
+    read, names = worker.read_logs, list[str]()
+    monkeypatch.setattr(worker, "_kept", {})
+    monkeypatch.setattr(worker, "read_logs", lambda *a: [names.extend(map(str, a[1])), read(*a)][1])
+    replayed(study(), "out", pieces="kept", crew=Shuffled())
+    assert sorted(names) == ["a.mcap", "b.mcap"]
+    replayed(study(runs=140), "out", pieces="kept", crew=Shuffled())
+    assert len(names) == 4  # the experiment is another
+    os.utime("a.mcap", ns=(0, 1))
+    replayed(study(runs=140), "out", pieces="kept", crew=Shuffled())
+    assert names[4:] == ["a.mcap"]
+    monkeypatch.setattr(worker, "STATES_HELD", 1)
+    replayed(study(runs=150), "out", pieces="kept", crew=Shuffled())
+    assert len(names) >= 5 + 3  # to be surveyed, then at least the one that was surveyed first
+
+
+def test_a_worker_replays_what_it_has_surveyed(connected: Callable[..., DaskWorkers]) -> None:
+    """As soon as it is idle; what is in memory of no worker, or of a busy one, goes first to one that has nothing."""
+    workers = connected()
+    tasks = deque(Task(LogTask(name, Path(f"{name}.mcap"), "", "", "", ())) for name in "abcde")
+    workers._has = {task.log: f"worker {k % 2}" for k, task in enumerate(tasks)}
+    workers._idle = ["worker 1"]
+    assert [workers.next(tasks).log.name for _ in range(2)] == ["b", "a"]
+    workers._idle = ["worker 1", "worker 2"]
+    assert [workers.next(tasks).log.name for _ in range(3)] == ["d", "c", "e"]
+    replayed(study(), "out", pieces="kept", crew=workers)
+    assert {log.name for log in workers._has} == {*"abcde"}
+    assert len({*workers._has.values()} - {"worker 0", "worker 1"}) > 0
 
 
 def many(count: int) -> None:
