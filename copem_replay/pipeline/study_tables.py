@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import pandas as pd
@@ -40,8 +41,10 @@ class StudyTables:
 
     @cached_property
     def whole(self) -> pd.DataFrame:
-        """The rows of `detections.parquet`."""
-        return self._frame([tables.rows for tables in self.each()])
+        """The rows of `detections.parquet` of all logs."""
+        rows = self._frame([tables.rows for tables in self.each()])
+        self._held = {log: replace(tables, rows=pd.DataFrame()) for log, tables in self._held.items()}
+        return rows
 
     @property
     def many(self) -> bool:
@@ -57,7 +60,7 @@ class StudyTables:
         return self._last[1]
 
     def each(self) -> Iterator[LogTables]:
-        """The tables of one log after the other."""
+        """The tables of one log after the other; without rows where these are in `whole`."""
         return map(self._of, self.counts)
 
     def parts(self) -> Iterator[tuple[pd.DataFrame, Sequence[LogTables]]]:
