@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,17 +17,16 @@ from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.file import Source, load, parse, places_of
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.together import File, Place, first_of
-from copem_replay.metrics.config import Measure
 from copem_replay.metrics.fixed import Fixed, fixed_in
 from copem_replay.results.belongings import MARK, check_still
 from copem_replay.results.by_log import LogRows, log_rows
+from copem_replay.results.provenance import Provenance, read_provenance
 from copem_replay.results.tables import (
     AGAIN,
     BRAKING,
     CONFLICT,
     DETECTIONS,
     EXACT,
-    FORMAT,
     OPTIONAL,
     ROWS,
     VERDICTS,
@@ -39,36 +37,6 @@ from copem_replay.results.tables import (
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-@dataclass(frozen=True)
-class LogFile:
-    """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content.
-
-    `truth`: the SHA-256 of its truth, None: an older version did not say it.
-    """
-
-    name: str
-    topic: str | None
-    sha256: str
-    truth: str | None = None
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """`provenance.json`. `measure` has every default filled in. `data`: the whole file."""
-
-    logs: tuple[LogFile, ...]
-    seed: int
-    runs: int
-    visibility: str | None
-    max_gap_s: float | None
-    window_s: object
-    measure: dict[str, Any]
-    braking: dict[str, Any] | None
-    horizon_used_s: float | None
-    run_shown: dict[str, int]  # by log
-    data: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +221,7 @@ def open_results(folder: Path | str, *more: str) -> Results:
         raise InputError(f"{folder}: expected a results folder, found {found}; `copem-replay run` writes one")
     _check_there(folder, MARK, "experiment.yaml", "detections.parquet", *more)
     seen = os.stat(folder)
-    return Results(folder, seen, _provenance(folder / MARK))
+    return Results(folder, seen, read_provenance(folder / MARK))
 
 
 def _check_there(folder: Path, *names: str) -> None:
@@ -303,42 +271,6 @@ def _check(folder: Path, table: pd.DataFrame, experiment: Experiment) -> None:
         raise InputError(
             f"{place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
         )
-
-
-def check_format(folder: Path) -> None:
-    """Raises InputError, one line, where results are of another format than this version reads; none says nothing."""
-    if (folder / MARK).is_file():
-        _provenance(folder / MARK)
-
-
-def _provenance(path: Path) -> Provenance:
-    """Read `provenance.json`. Raises InputError."""
-    try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-        if (found := dict(data).get("format", 1)) != FORMAT:
-            raise InputError(f"{path.parent}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
-        logs = tuple(
-            LogFile(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth")) for log in data["logs"]
-        )
-        measure, braking, gap_s = dict(data["measure"]), data.get("braking"), data.get("max_gap_s")
-        used_s, run_shown = measure.pop("horizon_used_s", None), data.get("run_shown") or {}
-        return Provenance(
-            logs=logs,
-            seed=int(data["seed"]),
-            runs=int(data["runs"]),
-            visibility=data.get("visibility"),
-            max_gap_s=None if gap_s is None else float(gap_s),
-            window_s=data.get("window_s"),
-            # A key that an older version did not have stood for its default.
-            measure=Measure().model_dump(mode="json", by_alias=True) | measure,
-            braking=None if braking is None else dict(braking),
-            horizon_used_s=None if used_s is None else float(used_s),
-            run_shown={str(log): int(run) for log, run in run_shown.items() if run is not None},
-            data=data,
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise InputError(f"{path}: expected the provenance of results, found damage: {why}; {AGAIN}") from None
 
 
 def _knows_ids(configuration: dict[str, Any]) -> bool:

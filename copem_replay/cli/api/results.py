@@ -94,7 +94,7 @@ def view(results: AnyResults, *, web: bool = False) -> None:
     Traceback (most recent call last):
     copem_replay.core.errors.InputError: out/nowhere: no such folder
     """
-    from copem_replay.results.read import check_format
+    from copem_replay.results.provenance import check_format
     from copem_replay.viewer.opening import open_viewer, recordings_of
 
     folder = folder_of(results)

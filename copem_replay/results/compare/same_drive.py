@@ -14,7 +14,8 @@ from copem_replay.core.errors import InputError
 
 if TYPE_CHECKING:
     from copem_replay.results.compare.labels import Named
-    from copem_replay.results.read import LogFile, Results
+    from copem_replay.results.provenance import LogFile
+    from copem_replay.results.read import Results
 
 _SHOWN = 12
 """So many differences of two folders are listed (chosen: what is more is another study)."""
