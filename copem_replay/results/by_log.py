@@ -6,7 +6,8 @@ any order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +29,7 @@ class LogRows:
     place: Path
     kinds: Mapping[str, str]
     where: Mapping[str, Sequence[tuple[Path, int, int, int]]]
-    configurations: tuple[str, ...]  # that have rows, in their order
+    counts: Mapping[tuple[str, str], int]  # rows by log and configuration, in the order of both
     without_rows: pa.Table
     _last: dict[tuple[Path, int], pa.Table] = field(default_factory=dict)
 
@@ -51,9 +52,21 @@ class LogRows:
                 table = table.set_column(k, name, table[name].cast(pa.string()))
         return table
 
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        """Those that have rows, in their order."""
+        return tuple(dict.fromkeys(configuration for _, configuration in self.counts))
+
+    def only(self, names: Iterable[str]) -> LogRows:
+        """The same with these of its columns."""
+        there = self.without_rows.column_names
+        return replace(self, kinds={name: self.kinds.get(name, "") for name in names if name in there}, _last={})
+
     def renamed(self, to: Mapping[str, str]) -> LogRows:
         """The same of logs by other names."""
-        return replace(self, where={to.get(log, log): of for log, of in self.where.items()}, _last={})
+        where = {to.get(log, log): of for log, of in self.where.items()}
+        counts = {(to.get(log, log), configuration): n for (log, configuration), n in self.counts.items()}
+        return replace(self, where=where, counts=counts, _last={})
 
 
 def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) -> LogRows:
@@ -66,7 +79,7 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
 
     names, schema = ["log", "configuration"], pa.schema([])
     where: dict[str, list[tuple[Path, int, int, int]]] = {}
-    configurations: dict[str, None] = {}
+    counts: Counter[tuple[str, str]] = Counter()
     for path in files or [place]:
         with _damage(place):
             file = parquet.ParquetFile(path, read_dictionary=names)
@@ -83,10 +96,13 @@ def log_rows(place: Path, kinds: Mapping[str, str], files: Sequence[Path] = ()) 
                 group = file.read_row_group(k, names).unify_dictionaries()
             for name in names:
                 check_text(place, name, group[name])
-            configurations |= dict.fromkeys(group["configuration"].unique().to_pylist())
+            found = group.group_by(names, use_threads=False).aggregate([([], "count_all")]).to_pydict()
+            counts.update(
+                dict(zip(zip(found["log"], found["configuration"], strict=True), found["count_all"], strict=True))
+            )
             for log, begin, end in _stretches(group["log"].combine_chunks()):
                 where.setdefault(log, []).append((path, k, begin, end))
-    return LogRows(place, kinds, where, tuple(configurations), schema.empty_table())
+    return LogRows(place, kinds, where, counts, schema.empty_table())
 
 
 @contextmanager

@@ -18,6 +18,8 @@ from copem_replay.experiment.file import Source, load, parse, places_of
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.together import File, Place, first_of
 from copem_replay.metrics.fixed import Fixed, fixed_in
+from copem_replay.metrics.intervals import clusters
+from copem_replay.metrics.tally import DETECTED
 from copem_replay.results.belongings import MARK, check_still
 from copem_replay.results.by_log import LogRows, log_rows
 from copem_replay.results.provenance import Provenance, read_provenance
@@ -29,6 +31,7 @@ from copem_replay.results.tables import (
     EXACT,
     OPTIONAL,
     ROWS,
+    TALLY,
     VERDICTS,
     file_of,
     read_csv,
@@ -37,6 +40,8 @@ from copem_replay.results.tables import (
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+_MAY_BE_FOLDERS = ("detections.parquet", "tally.parquet")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +87,44 @@ class Results:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """`detections.parquet`."""
-        experiment = self.experiment
-        columns = ROWS + (BRAKING if experiment.braking else ()) + (CONFLICT if experiment.measure.conflict else ())
-        return self._frame("detections.parquet", columns)
+        """`detections.parquet` as a whole, for users: figures take `known` or `each`, whatever its size."""
+        return self._frame("detections.parquet", self.columns)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of `detections.parquet` that are needed."""
+        braking, conflict = self.experiment.braking, self.experiment.measure.conflict
+        return tuple(ROWS | (BRAKING if braking else {}) | (CONFLICT if conflict else {}))
+
+    @cached_property
+    def rows(self) -> LogRows:
+        """Where the rows of each log are in `detections.parquet`."""
+        place = self.folder / "detections.parquet"
+        found = log_rows(place, self._compared, self._files(place))
+        check_still(self.folder, self.seen)
+        return found
+
+    def each(self, *columns: str, log: str | None = None) -> Iterator[pd.DataFrame]:
+        """Rows log by log, or of one log, with these of the columns; none named: all but the log's name."""
+        rows = self.rows.only(columns or [name for name in self.rows.without_rows.column_names if name != "log"])
+        for one in self.rows.where if log is None else [log]:
+            yield rows.of(one).to_pandas()
+        check_still(self.folder, self.seen)
+
+    @cached_property
+    def tally(self) -> pd.DataFrame:
+        """`tally.parquet`."""
+        return self._frame("tally.parquet", (*TALLY, *(("in_conflict", "passed") if self.experiment.braking else ())))
+
+    @cached_property
+    def known(self) -> pd.DataFrame:
+        """In how many `runs` each object is detected when; of one object alone run by run, for these are resampled."""
+        tally = self.tally[self.tally["event"] == DETECTED]
+        if not len(tally) or clusters(tally)[0] != "runs":
+            return tally
+        columns = [name for name in TALLY if name not in ("log", "event", "runs")]
+        (rows,) = self.each(*columns, "run", log=str(tally["log"].iloc[0]))
+        return rows.assign(log=tally["log"].iloc[0], runs=1)
 
     @cached_property
     def summary(self) -> pd.DataFrame:
@@ -128,14 +167,12 @@ class Results:
     @cached_property
     def by_log(self) -> dict[str, LogRows]:
         """The tables that comparisons read, by file name, those that are there."""
-        place = self.folder / "detections.parquet"
-        columns = DETECTIONS | (VERDICTS if self.provenance.braking is not None else {})
-        tables = {place.name: log_rows(place, columns, self._files(place))}
-        found = tables[place.name].where
-        if not found:
+        rows = self.rows.only(self._compared)
+        if not rows.where:
             raise InputError(f"{self.folder}: nothing can be compared: no measured object has an onset")
-        if unknown := set(found) - {log.name for log in self.provenance.logs}:
-            raise InputError(f"{place}: expected the logs of provenance.json, found {min(unknown)!r}")
+        if unknown := set(rows.where) - {log.name for log in self.provenance.logs}:
+            raise InputError(f"{rows.place}: expected the logs of provenance.json, found {min(unknown)!r}")
+        tables = {rows.place.name: rows}
         there = {name: kinds for name, kinds in OPTIONAL.items() if (self.folder / name).is_file()}
         tables |= {name: log_rows(self.folder / name, kinds) for name, kinds in there.items()}
         check_still(self.folder, self.seen)
@@ -191,6 +228,11 @@ class Results:
                 raise InputError(f"{self.folder}: configurations: expected some of {', '.join(known)}, found {name!r}")
         return tuple(dict.fromkeys(configurations)) if configurations else known
 
+    @property
+    def _compared(self) -> dict[str, str]:
+        """Columns of `detections.parquet` that comparisons read, and their kinds."""
+        return DETECTIONS | (VERDICTS if self.provenance.braking is not None else {})
+
     def _files(self, place: Path) -> list[Path]:
         """Of a table that is a folder, in the order of the logs; none: it is a file."""
         if not place.is_dir():
@@ -226,7 +268,7 @@ def open_results(folder: Path | str, *more: str) -> Results:
 
 def _check_there(folder: Path, *names: str) -> None:
     for name in names:
-        if not (folder / name).is_file() and not (name == "detections.parquet" and (folder / name).is_dir()):
+        if not (folder / name).is_file() and not (name in _MAY_BE_FOLDERS and (folder / name).is_dir()):
             raise InputError(
                 f"{folder}: expected a results folder, found no {name} in it; `copem-replay run` writes one"
             )
@@ -242,9 +284,19 @@ def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
 
 def complete(results: Results, *, rowless: bool = False) -> Results:
     """The same, with every table read and held against the experiment. Raises InputError."""
-    _check_there(results.folder, "summary.csv")
-    if len(results.table) or not rowless:
-        _check(results.folder, results.table, results.experiment)
+    _check_there(results.folder, "summary.csv", "tally.parquet")
+    experiment, rows = results.experiment, results.rows
+    if missing := [name for name in results.columns if name not in rows.kinds]:
+        raise InputError(f"{rows.place}: expected the column {missing[0]}, found none; {AGAIN}")
+    if rows.where or not rowless:
+        _check(rows, experiment)
+    counts = results.known.groupby(["log", "configuration"])["runs"].sum()
+    if counts.to_dict() != rows.counts:
+        expected, found = sum(rows.counts.values()), int(counts.sum())
+        raise InputError(
+            f"{results.folder}/tally.parquet: expected the {expected} rows of detections.parquet counted, found "
+            f"{found}; {AGAIN}"
+        )
     expected, found = len(results.experiment.logs), len(results.provenance.logs)
     if expected != found:
         raise InputError(
@@ -255,21 +307,21 @@ def complete(results: Results, *, rowless: bool = False) -> Results:
     return results
 
 
-def _check(folder: Path, table: pd.DataFrame, experiment: Experiment) -> None:
+def _check(rows: LogRows, experiment: Experiment) -> None:
     """Raise InputError where the rows are of another experiment, are not all there, or there are none."""
-    place = folder / "detections.parquet"
-    unknown = [name for name in table["configuration"].unique() if name not in experiment.configurations]
+    unknown = [name for name in rows.configurations if name not in experiment.configurations]
     if unknown:
-        raise InputError(f"{place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
-    if not len(table):
-        raise InputError(f"{place}: expected rows to draw, found none: no measured object has an onset")
+        raise InputError(f"{rows.place}: expected the configurations of experiment.yaml, found {unknown[0]!r}; {AGAIN}")
+    if not rows.where:
+        raise InputError(f"{rows.place}: expected rows to draw, found none: no measured object has an onset")
     # A configuration that has none of its units in a log is left out of that log.
-    counts = [int(n) for n in table.groupby(["log", "configuration"], sort=False).size()]
-    counts += [0] * (set(experiment.configurations) != set(table["configuration"]))
-    of_log = table.groupby(["log", "configuration"], sort=False).size().groupby("log").agg(["min", "max"])
-    if 0 in counts or (of_log["min"] != of_log["max"]).any():
+    counts = [*rows.counts.values(), *[0] * (set(experiment.configurations) != set(rows.configurations))]
+    of_log: dict[str, set[int]] = {}
+    for (log, _), count in rows.counts.items():
+        of_log.setdefault(log, set()).add(count)
+    if 0 in counts or any(len(of) > 1 for of in of_log.values()):
         raise InputError(
-            f"{place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
+            f"{rows.place}: expected as many rows of each configuration, found {min(counts)} to {max(counts)}; {AGAIN}"
         )
 
 

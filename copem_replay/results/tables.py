@@ -30,10 +30,6 @@ FORMAT = 2
 AGAIN = "run the experiment again with --overwrite"
 """What helps against a table that is damaged or of an older version."""
 
-NUMBERS = ("run", "onset_s", "captured_s", "detection_s", "time_to_detection_s", "distance_at_detection_m", "ended_s")
-ROWS = ("log", "configuration", "object_id", "object_class", "detected", "ended_by", *NUMBERS)
-BRAKING = ("conflict", "braking_pass", "brake_s", "min_distance_m", "impact_s", "impact_speed_mps")
-CONFLICT = ("conflict_detected", "conflict_detection_s", "distance_at_conflict_detection_m")
 EXACT = ("log", "configuration", "object_id", "time_to_detection_s", "probability")
 _KEYS = {"log": "text", "configuration": "text", "run": "whole numbers"}
 _OBJECT = _KEYS | {"object_id": "text"}
@@ -46,6 +42,16 @@ DETECTIONS = _OBJECT | {
     "ended_by": "text",
 }
 VERDICTS = {"conflict": "true or false", "braking_pass": "true or false"}
+"""What comparisons read of `detections.parquet`, and where there is braking; below, what figures read besides."""
+ROWS = DETECTIONS | {"object_class": "text", "captured_s": "numbers", "time_to_detection_s": "numbers"}
+BRAKING = VERDICTS | dict.fromkeys(("brake_s", "min_distance_m", "impact_s", "impact_speed_mps"), "numbers")
+CONFLICT = {
+    "conflict_detected": "true or false",
+    "conflict_detection_s": "numbers",
+    "distance_at_conflict_detection_m": "numbers",
+}
+_OF_OBJECT = ("object_id", "object_class", "onset_s", "ended_s", "ended_by")
+TALLY = ("log", "configuration", "event", *_OF_OBJECT, "time_to_detection_s", "distance_at_detection_m", "runs")
 OPTIONAL = {
     "accuracy.parquet": _OBJECT
     | {
@@ -65,8 +71,11 @@ OPTIONAL = {
     "thresholds.parquet": _OBJECT | {"existence": "numbers", "detection_s": "numbers"},
 }
 """Files of a results folder that need not be there, and the columns of them that comparisons read."""
-MAY_HAVE = {"instants.parquet": {"run": "whole numbers"}}
-"""Columns that a file has where runs differ in their units."""
+MAY_HAVE = {"detections.parquet": ROWS | BRAKING | CONFLICT, "instants.parquet": {"run": "whole numbers"}}
+"""Columns that a file need not have; instants are of runs where these differ in their units."""
+_NUMBERS = {name for name, kind in (ROWS | CONFLICT).items() if kind in ("numbers", "whole numbers")} | {
+    "value", "list_rate_hz", "probability", "n", "runs",
+}  # fmt: skip
 
 
 def read_csv(path: Path) -> pd.DataFrame:
@@ -85,7 +94,7 @@ def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], columns: Sequ
         raise InputError(f"{path}: expected a table that can be read, found damage: {why}; {AGAIN}") from None
     if missing := [name for name in columns if name not in table.columns]:
         raise InputError(f"{path}: expected the column {missing[0]}, found none; {AGAIN}")
-    for name in set(columns) & {*NUMBERS, "value", "list_rate_hz", "probability", "n"}:
+    for name in _NUMBERS.intersection(columns):
         if table[name].dtype.kind not in "iuf" and table[name].notna().any():
             raise InputError(f"{path}: column {name}: expected numbers, found {table[name].dtype}; {AGAIN}")
     return table

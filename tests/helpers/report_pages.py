@@ -8,13 +8,19 @@ brakes with 8 m/s², which takes 1.25 s and 6.25 m. Known after l seconds, it st
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
 
+import pandas as pd
+
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import problems, read_logs
+from copem_replay.metrics.tally import tally
 from copem_replay.pipeline.run import run
+from copem_replay.results.contents import write_parquet
+from copem_replay.results.read import Results, load_results
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -87,6 +93,14 @@ def replayed(place: Path, text: str = TEXT, *logs: str) -> Path:
     assert not refused + found
     write_results(place / "results", experiment, recordings, run(experiment, recordings), exporters=EXPORTERS)
     return place / "results"
+
+
+def with_rows(results: Results, table: pd.DataFrame, folder: Path) -> Results:
+    """A copy of results with other rows of `detections.parquet`, tallied."""
+    shutil.copytree(results.folder, folder)
+    write_parquet(table, folder / "detections.parquet")
+    write_parquet(tally(table), folder / "tally.parquet")
+    return load_results(folder)
 
 
 @dataclass

@@ -46,7 +46,7 @@ from copem_replay.report.html.study import load_study
 from copem_replay.results.compare import compare
 from copem_replay.results.read import Results, load_results
 from copem_replay.viewer.selection import telling
-from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed
+from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, replayed, with_rows
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ class TestEighteen:
         assert set(rows(answer_figure(many).axes[0])) == every - {"GT"}
         assert set(rows(differences_figure(many).axes[0])) == every - {"GT", "c00"}
 
-    def test_those_that_detect_alike_count_once(self, many: Results) -> None:
+    def test_those_that_detect_alike_count_once(self, many: Results, tmp_path: Path) -> None:
         table = many.table.copy()
         keys = ["log", "object_id", "run"]
         first = table[table["configuration"] == "c00"].set_index(keys)["time_to_detection_s"]
@@ -232,8 +232,7 @@ class TestEighteen:
         table.loc[alike, "time_to_detection_s"] = first.reindex(
             pd.MultiIndex.from_frame(table.loc[alike, keys])
         ).to_numpy()
-        changed_one = Results(many.folder, many.seen, many.provenance)
-        changed_one.__dict__["table"] = table
+        changed_one = with_rows(many, table, tmp_path / "alike")
         names = tuple(many.experiment.configurations)
         found = that_differ(changed_one, names)
         assert set(found) & {f"c{k:02}" for k in range(10)} == {"c00"}
@@ -260,17 +259,15 @@ class TestWhichObject:
         table["conflict"] = [data.draw(st.booleans())] * len(table)
         assert most_telling(table, ("GT",)) == ("x", telling(table, ("GT",), 1)[0])
 
-    def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results) -> None:
+    def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results, tmp_path: Path) -> None:
         """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
         assert choose(two, Selection()).object_id == "2"
-        without = Results(two.folder, two.seen, two.provenance)
-        table = two.table.drop(columns="conflict")
+        table = two.table.assign(conflict=False)
         run = int(table.loc[table["configuration"] == "half"].sort_values("time_to_detection_s")["run"].iloc[-1])
         of_run = table[(table["run"] == run) & (table["configuration"] != "GT")]
         late_s = of_run["time_to_detection_s"].fillna(of_run["ended_s"] - of_run["onset_s"])
         spread = late_s.groupby(of_run["object_id"]).agg(lambda s: s.max() - s.min())
-        without.__dict__["table"] = table
-        chosen = choose(without, Selection(run=run))
+        chosen = choose(with_rows(two, table, tmp_path / "without"), Selection(run=run))
         assert spread[chosen.object_id] == spread.max()
         assert len(chosen.configurations) == 4
         assert (chosen.configurations[0], chosen.configurations[-1]) == ("never", "GT")

@@ -20,6 +20,8 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
@@ -34,11 +36,12 @@ from copem_replay.pipeline.run import run
 from copem_replay.report.figures.bands import band, resampled_incidence
 from copem_replay.report.figures.captions import percent, short_names
 from copem_replay.report.figures.detection_curves import curves_figure
-from copem_replay.report.figures.distances import FAIL, NEUTRAL, PASS, distances_figure, spread
+from copem_replay.report.figures.distances import distances_figure
 from copem_replay.report.figures.label_layout import last_instant
 from copem_replay.report.figures.latency_breakdown import latency_breakdown_figure
 from copem_replay.report.figures.selection import Selection, choose
 from copem_replay.report.figures.single_runs import runs_figure
+from copem_replay.report.figures.strips import FAIL, KINDS, NEUTRAL, PASS, Strip
 from copem_replay.report.figures.style import appearances
 from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.figures.timeline import Event
@@ -47,6 +50,7 @@ from copem_replay.results.read import Results, load_results
 from copem_replay.results.write import write_results
 from copem_replay.viewer.export import EXPORTERS
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.report_pages import with_rows
 
 TEXT = """\
 version: 1
@@ -255,6 +259,8 @@ class TestCommand:
                 "/detections.parquet: expected a table that can be read, found damage: ",
             ),
             ("detections.parquet", None, ": expected a results folder, found no detections.parquet in it; "),
+            ("tally.parquet", b"PAR1 no", "/tally.parquet: expected a table that can be read, found damage: "),
+            ("tally.parquet", None, ": expected a results folder, found no tally.parquet in it; "),
             ("provenance.json", b"{", "/provenance.json: expected the provenance of results, found damage: "),
             (
                 "provenance.json",
@@ -291,6 +297,12 @@ class TestCommand:
             ended = call(mine)
             assert ended.code == 2
             assert said in ended.lines[0]
+
+    def test_a_tally_of_other_rows(self, call: Callable[..., Ended], mine: Path) -> None:
+        pd.read_parquet(mine / "tally.parquet").iloc[1:].to_parquet(mine / "tally.parquet")
+        ended = call(mine)
+        assert (ended.code, len(ended.lines)) == (2, 1)
+        assert "/tally.parquet: expected the 30 rows of detections.parquet counted, found 27; " in ended.lines[0]
 
     def test_no_folder(self, call: Callable[..., Ended], mine: Path, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
@@ -460,25 +472,66 @@ class TestDistances:
         assert halo.get_zorder() < cross.get_zorder()
         np.testing.assert_array_equal(halo.get_offsets(), cross.get_offsets())
 
-    def test_foreseen_collisions_have_a_panel(self, mine: Path) -> None:
+    def test_foreseen_collisions_have_a_panel(self, mine: Path, tmp_path: Path) -> None:
         table = pd.read_parquet(mine / "detections.parquet")
         table["conflict_detected"] = table["configuration"] == "GT"
-        table["distance_at_conflict_detection_m"] = np.where(table["conflict_detected"], 12.0, np.nan)
-        table.loc[0, "distance_at_conflict_detection_m"] = np.nan  # while the truth has a gap
-        table.to_parquet(mine / "detections.parquet")
-        figure = distances_figure(load_results(mine))
+        for name in ("conflict_detection_s", "time_to_conflict_detection_s", "distance_at_conflict_detection_m"):
+            table[name] = np.where(table["conflict_detected"], 12.0, np.nan)
+        table.loc[table["object_id"] == "2", "distance_at_conflict_detection_m"] = np.nan  # while the truth has a gap
+        figure = distances_figure(with_rows(load_results(mine), table, tmp_path / "foreseen"))
         assert len(figure.axes) == 2
         # He brakes for the object, so that passing says nothing of this event.
-        assert points(figure.axes[1]) == {"GT: not in conflict": pytest.approx([12.0] * 5)}
+        assert points(figure.axes[1]) == {"GT: not in conflict": pytest.approx([12.0] * 3)}
         assert [text.get_text() for text in figure.axes[1].texts if text.get_text().isdigit()] == ["0", *["6"] * 4]
-        assert "Without a point: 1 detection" in note(figure)
+        assert "Without a point: 3 detections" in note(figure)
 
-    def test_spread_is_as_wide_as_there_are_many(self) -> None:
-        across = spread(
-            np.array([5.0, 5.0, 5.0, 5.0, 9.0, 7.0, 7.01]), [PASS, FAIL, PASS, NEUTRAL, PASS, PASS, PASS], 0.5
-        )
+    @staticmethod
+    def strip(distance_m: Sequence[float], kind: Sequence[int]) -> Strip:
+        """Of points, in bins half a metre wide: each was counted alone."""
+        one = {"distance_at_detection_m": distance_m, "time_to_detection_s": 1.0, "runs": 1, "in_conflict": True}
+        tally = pd.DataFrame(one).assign(passed=np.array(kind) == KINDS.index(PASS))
+        tally["in_conflict"] = np.array(kind) != KINDS.index(NEUTRAL)
+        return Strip.of(tally.astype({"passed": int}), 0.5, judged=True)
+
+    def test_strips_are_as_wide_as_there_are_many(self) -> None:
+        distance_m = np.array([5.0, 5.0, 5.0, 5.0, 9.0, 7.0, 7.01])
+        kind = np.array([KINDS.index(one) for one in (PASS, FAIL, PASS, NEUTRAL, PASS, PASS, PASS)])
+        strip = self.strip(distance_m, kind)
+        across, drawn = strip.place(distance_m, kind, np.zeros_like(strip.count))
         # Four in a bin: the middles of quarters of −1 … 1, failures first; one alone: 0; two over half of it.
         assert across == pytest.approx([0.25, -0.75, 0.75, -0.25, 0, -0.25, 0.25])
+        assert drawn.all()
+
+    @given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 2)), min_size=1, max_size=40), st.integers(0, 40))
+    @settings(max_examples=80, deadline=None)
+    def test_points_find_their_places_log_by_log(self, points: list[tuple[int, int]], cut: int) -> None:
+        """However the rows are cut, as if all were there: of a bin those of a kind in their order, evenly."""
+        distance_m, kind = np.array([one / 8 for one, _ in points]), np.array([one for _, one in points])
+        strip = self.strip(distance_m, kind)
+        before = np.zeros_like(strip.count)
+        parts = [strip.place(distance_m[of], kind[of], before)[0] for of in (slice(0, cut), slice(cut, None))]
+        bins = [int(np.floor(one / 0.5 + 0.5)) for one in distance_m]
+        widest = max(bins.count(one) for one in bins)
+        for row, found in enumerate(np.concatenate(parts)):
+            ranked = sorted((kind[k], k) for k in range(len(bins)) if bins[k] == bins[row])
+            place, many = ranked.index((kind[row], row)), len(ranked)
+            assert found == pytest.approx((2 * (place + 0.5) / many - 1) * many / widest)
+        np.testing.assert_array_equal(before, strip.count)
+
+    def test_of_very_many_in_a_bin_some_are_drawn(self, mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Every other of six, from one edge to the other, and it is said."""
+        distance_m, kind = np.full(6, 5.0), np.zeros(6, dtype=int)
+        monkeypatch.setattr("copem_replay.report.figures.strips.MOST", 3)
+        monkeypatch.setattr("copem_replay.report.figures.distances.MOST", 3)
+        strip = self.strip(distance_m, kind)
+        across, drawn = strip.place(distance_m, kind, np.zeros_like(strip.count))
+        assert across[drawn] == pytest.approx([-5 / 6, -1 / 6, 3 / 6])
+        assert "Of more than" not in note(distances_figure(load_results(mine)))
+        monkeypatch.setattr("copem_replay.report.figures.strips.MOST", 2)
+        monkeypatch.setattr("copem_replay.report.figures.distances.MOST", 2)
+        figure = distances_figure(load_results(mine))
+        assert "Of more than 2 points at nearly one distance 2 are drawn" in note(figure)
+        assert len(points(figure.axes[0])["GT: passes"]) == 2
 
 
 class TestCurves:

@@ -427,11 +427,10 @@ class TestNeverDetected:
     def test_counts_runs_by_log_object_and_configuration(self) -> None:
         rows = pd.DataFrame(
             [
-                ("a", "1", "A", True), ("a", "1", "A", False), ("a", "1", "A", False),
-                ("a", "1", "B", True), ("a", "1", "B", True), ("a", "1", "B", True),
-                ("b", "1", "A", True), ("b", "1", "A", True), ("b", "1", "A", False),
+                ("a", "1", "A", 0.5, 1), ("a", "1", "A", None, 2), ("a", "1", "B", 0.5, 3),
+                ("b", "1", "A", 0.1, 1), ("b", "1", "A", 0.7, 1), ("b", "1", "A", None, 1),
             ],
-            columns=["log", "object_id", "configuration", "detected"],
+            columns=["log", "object_id", "configuration", "time_to_detection_s", "runs"],
         ).assign(object_class="car", onset_s=0.0, ended_s=1.0, ended_by="log_end")  # fmt: skip
         found = misses(rows)[["log", "object_id", "configuration", "missed", "runs"]].to_numpy().tolist()
         assert found == [["a", "1", "A", 2, 3], ["b", "1", "A", 1, 3]]

@@ -56,7 +56,7 @@ def answer_figure(results: Results, *, configurations: Sequence[str] | None = No
 def _times(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:
     """A dot of each, and first of all what has no interval, and why."""
     rows = results.summary.set_index("configuration")
-    over, cluster = clusters(results.table)
+    over, cluster = clusters(results.known)
     fixed = fixed_in(results.experiment.as_written())
     dots: list[Dot] = []
     without: dict[str, list[str]] = {}
@@ -71,9 +71,10 @@ def _times(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]
         limits = None
         reason = few_in_words(results) if over is None else "every run is the same"
         if over is not None and not (over == "runs" and fixed.known(name)):
-            mine = results.table["configuration"] == name
-            time_s, ending = endings(results.table[mine])
-            limits = mean_limits(np.round(time_s, 9), ending, list(cluster[mine]), horizon_s, results.experiment.seed)
+            mine = results.known["configuration"] == name
+            time_s, ending, runs = endings(results.known[mine])
+            seed = results.experiment.seed
+            limits = mean_limits(np.round(time_s, 9), ending, list(cluster[mine]), horizon_s, seed, runs)
             reason = f"all {over} alike"
         if limits is None:
             without.setdefault(reason, []).append(name)
@@ -136,7 +137,7 @@ def _from_zero(axes: Axes, dots: Sequence[Dot]) -> None:
 
 
 def _note(results: Results, names: Sequence[str], rows: pd.DataFrame, *, intervals: bool) -> list[str]:
-    over = clusters(results.table)[0]
+    over = clusters(results.known)[0]
     said = [study(results, names)]
     if intervals:
         said.append(f"Lines: 95 % intervals over {over}. Two that overlap may differ for sure: see the differences")

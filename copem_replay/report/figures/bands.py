@@ -24,18 +24,22 @@ _CELLS = 4_000_000
 """Resamples × rows held at a time (chosen: 32 MB a column)."""
 
 
-def band(time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int) -> tuple[Float, Float]:
+def band(
+    time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: int, runs: Int | None = None
+) -> tuple[Float, Float]:
     """Limits (G,) of the cumulative incidence at instants (G,).
 
-    `time_s (n,)`, `ending (n,)` as in `statistics.cumulative_incidence`; `cluster (n,)`: the name of each row's.
+    `time_s (n,)`, `ending (n,)` as in `statistics.cumulative_incidence`; `cluster (n,)`: the name of each row's;
+    `runs (n,)`: how often it counts, None: once.
     """
+    runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
     names, of = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
     resampled = resamples([str(name) for name in names], seed, RESAMPLES)
     # Rows of one cluster that end alike at one time are one row that counts as often.
     order = np.lexsort((of, ending, time_s))
     keys = np.stack([time_s, ending, of])[:, order]
     first = np.flatnonzero(np.append(True, (np.diff(keys) != 0).any(axis=0)))
-    alike = np.diff(np.append(first, len(order)))
+    alike = np.diff(np.append(0, np.cumsum(runs[order]))[np.append(first, len(order))])
     kept = order[first]
 
     def curves(count: Counts) -> Float:
@@ -43,7 +47,7 @@ def band(time_s: Float, ending: Int, cluster: Sequence[str], at_s: Float, seed: 
 
     size = max(1, _CELLS // max(len(kept), len(at_s)))
     blocks = [curves(resampled.count[k : k + size]) for k in range(0, len(resampled.count), size)]
-    share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(of))
+    share, n = curves(np.ones((1, len(names)), dtype=np.uint32))[0], effective_number(np.bincount(of, runs))
     limits = [percentile_limits(at, resampled) for at in np.concatenate(blocks).T]
     of_all = [widened(*one, n)[1:] for one in zip(limits, share.tolist(), strict=True)]
     low, high = np.array(of_all).reshape(-1, 2).T
@@ -77,26 +81,28 @@ def resampled_incidence(time_s: Float, ending: Int, count: Int, at_s: Float) -> 
 
 
 def mean_limits(
-    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int
+    time_s: Float, ending: Int, cluster: Sequence[str], horizon_s: float, seed: int, runs: Int | None = None
 ) -> tuple[float, float] | None:
     """Limits of the restricted mean of times (n,) at a horizon; None: every resample has the same mean.
 
     Columns as of `band`. The same resamples as those of a share in `summary.csv`.
     """
+    runs = np.ones(len(time_s), dtype=np.int64) if runs is None else runs
     names, of = np.unique(np.asarray(cluster, dtype=str), return_inverse=True)
     resampled = resamples([str(name) for name in names], seed)
     if not (ending == CENSORED).any():  # no weight is handed on: sums of clusters are enough
         counted_s = np.where(ending == DETECTED, np.minimum(time_s, horizon_s), horizon_s)
-        sums = np.stack([np.bincount(of, counted_s), np.bincount(of)], axis=1)
+        sums = np.stack([np.bincount(of, counted_s * runs), np.bincount(of, runs)], axis=1)
         of_all = resampled.count.astype(float) @ sums
         return _apart(*percentile_limits(of_all[:, 0] / of_all[:, 1], resampled))
     order = np.lexsort((of, ending, time_s))
-    time_s, ending, of = time_s[order], ending[order], of[order]
+    time_s, ending, of, runs = time_s[order], ending[order], of[order], runs[order]
     at_s = np.unique(time_s[(ending == DETECTED) & (time_s < horizon_s)])
     lengths_s = np.diff(np.append(at_s, horizon_s))
     size = max(1, _CELLS // max(len(time_s), len(at_s), 1))
     means = [
-        horizon_s - resampled_incidence(time_s, ending, resampled.count[k : k + size][:, of].astype(np.int64), at_s)
+        horizon_s
+        - resampled_incidence(time_s, ending, resampled.count[k : k + size][:, of].astype(np.int64) * runs, at_s)
         @ lengths_s
         for k in range(0, len(resampled.count), size)
     ]  # fmt: skip

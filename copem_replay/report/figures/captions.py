@@ -27,11 +27,11 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
 def study(results: Results, names: Sequence[str]) -> str:
     """Which results these are, wherever they lie, and how many rows each configuration has."""
-    table = results.table[results.table["configuration"].isin(list(names))]
-    things = table.groupby(["log", "object_id"]).ngroups
-    logs = table["log"].nunique()
+    known = results.known[results.known["configuration"].isin(list(names))]
+    things = known.groupby(["log", "object_id"]).ngroups
+    logs = known["log"].nunique()
     where = f" in {counted(logs, 'log')}" if logs > 1 else ""
-    rows = len(table) / max(table["configuration"].nunique(), 1)
+    rows = known["runs"].sum() / max(known["configuration"].nunique(), 1)
     return (
         f"{counted(results.experiment.runs, 'run')} of {counted(things, 'object')}{where}, "
         f"n = {rows:.0f} per configuration, seed {results.experiment.seed}"
@@ -78,8 +78,8 @@ def plain(value: float) -> str:
 
 def few_in_words(results: Results) -> str:
     """How many there are of what would be resampled, where these are too few: `2 objects`."""
-    table = results.table
-    logs, things = table["log"].nunique(), table.groupby(["log", "object_id"]).ngroups
+    known = results.known
+    logs, things = known["log"].nunique(), known.groupby(["log", "object_id"]).ngroups
     if max(logs, things) >= FEWEST_CLUSTERS:
         return ""
     if things == 1:

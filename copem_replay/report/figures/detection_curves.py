@@ -80,26 +80,30 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
         return figure
 
 
-def endings(rows: pd.DataFrame) -> tuple[Float, Int]:
-    """Time (n,) from the onset to the detection or to the end of the episode, and how the episode ended (n,)."""
+def endings(rows: pd.DataFrame) -> tuple[Float, Int, Int]:
+    """Time (n,) from the onset to the detection or to the end of the episode, how the episode ended, in how many runs.
+
+    Of rows of `Results.known`.
+    """
     detected = rows["time_to_detection_s"].notna().to_numpy()
     looked_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     time_s = np.where(detected, rows["time_to_detection_s"].to_numpy(dtype=float), looked_s)
-    return time_s, np.where(detected, DETECTED, np.where(competes(rows["ended_by"]), LEFT, CENSORED))
+    ending = np.where(detected, DETECTED, np.where(competes(rows["ended_by"]), LEFT, CENSORED))
+    return time_s, ending, rows["runs"].to_numpy()
 
 
 def curves_of(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
     """What is resampled whole, or `NOTHING_DRAWN`; and the curves, with bands where there is something to resample."""
-    over, cluster = clusters(results.table)
+    over, cluster = clusters(results.known)
     same = [name for name in names if over == "runs" and fixed_in(results.experiment.as_written()).known(name)]
     over = NOTHING_DRAWN if same and len(same) == len(names) else over
     curves = {}
     for name in names:
-        rows = results.table["configuration"] == name
+        rows = results.known["configuration"] == name
         banded = bands and over is not None and name not in same
-        curves[name] = curve_of(results.table[rows], cluster[rows] if banded else None, results.experiment.seed)
+        curves[name] = curve_of(results.known[rows], cluster[rows] if banded else None, results.experiment.seed)
     return over, curves
 
 
@@ -107,13 +111,13 @@ def curve_of(rows: pd.DataFrame, cluster: pd.Series | None, seed: int) -> Detect
     """The curve of one configuration's rows (n,), with a band where it is said which cluster each row is of."""
     if not len(rows):
         return DetectionCurve(np.empty(0), np.empty(0))
-    time_s, ending = endings(rows)
-    times_s, share = cumulative_incidence(time_s, ending)
+    time_s, ending, runs = endings(rows)
+    times_s, share = cumulative_incidence(time_s, ending, runs.astype(float))
     if cluster is None or not len(times_s):
         return DetectionCurve(times_s, share)
     # Few enough steps for a file of a bearable size.
     kept = np.unique(np.linspace(0, len(times_s) - 1, min(len(times_s), _INSTANTS)).astype(int))
-    low, high = band(time_s, ending, list(cluster), times_s[kept], seed)
+    low, high = band(time_s, ending, list(cluster), times_s[kept], seed, runs)
     held = np.searchsorted(kept, np.arange(len(times_s)), side="right") - 1
     return DetectionCurve(times_s, share, low[held], high[held])
 

@@ -34,7 +34,7 @@ _PANELS = {
 
 def no_differences(results: Results, names: Sequence[str], differences: Comparison | None) -> str | None:
     """The reason why nothing can be drawn; None: it can."""
-    if not len(results.table):
+    if not len(results.known):
         return "no object is measured"
     against = default_baseline(results) if differences is None else differences.baseline
     return None if set(names) - {against} else "there is nothing to compare with"
@@ -128,7 +128,7 @@ def _without(
     there = [rows[name, metric] for metric in metrics for name in names if (name, metric) in rows]
     if any(not pd.isna(row.interval_over) for row in there):
         return []
-    over = clusters(results.table)[0]
+    over = clusters(results.known)[0]
     kinds = {row.interval for row in there}
     words = {ALL_ALIKE: f"each difference is the same in every {over[:-1] if over else 'object'}",
              NOTHING_DRAWN: "nothing is drawn, every run is the same"}  # fmt: skip

@@ -6,15 +6,18 @@ spread across the strip, as wide as there are many of them, those that fail belo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import Bool, Float
+from copem_replay.core.tracks import Float, Int
+from copem_replay.metrics.tally import CONFLICT, DETECTED
 from copem_replay.report.figures.captions import list_rates, percent, short_names, study
+from copem_replay.report.figures.strips import FAIL, KINDS, MOST, NEUTRAL, PASS, Strip, counts, kinds
 from copem_replay.report.figures.style import (
     FAINT,
     INK,
@@ -32,12 +35,10 @@ if TYPE_CHECKING:
 
     from copem_replay.results.read import Results
 
-_OBJECT, _CONFLICT = "distance_at_detection_m", "distance_at_conflict_detection_m"
-_WORDS = {_OBJECT: "Distance at detection (m)", _CONFLICT: "Distance when the collision is foreseen (m)"}
-_NEVER = {_OBJECT: "never\ndetected", _CONFLICT: "never\nforeseen"}
-_KNOWN = {_OBJECT: "detected", _CONFLICT: "conflict_detected"}
+_COLUMNS = {DETECTED: "distance_at_detection_m", CONFLICT: "distance_at_conflict_detection_m"}
+_WORDS = {DETECTED: "Distance at detection (m)", CONFLICT: "Distance when the collision is foreseen (m)"}
+_NEVER = {DETECTED: "never\ndetected", CONFLICT: "never\nforeseen"}
 
-PASS, FAIL, NEUTRAL = "passes", "fails", "not in conflict"
 _HALF = 0.38
 """Half the height of a strip's points, in strips (chosen)."""
 _BINS = 150
@@ -47,23 +48,34 @@ _FEW, _MANY = 600, 4000
 
 def distances_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Distance at detection of all rows, a strip per configuration; a second panel where collisions are foreseen."""
-    names = results.chosen(configurations)
-    table = results.table[results.table["configuration"].isin(names)]
-    columns = [name for name in (_OBJECT, _CONFLICT) if name in table]
-    with style():
-        figure = new_figure(1.6 + 4.4 * len(columns) + 0.6, 1.5 + 0.5 * len(names))
-        panels = figure.subplots(1, len(columns), sharex=True, sharey=True, squeeze=False)[0]
-        looks = appearances(tuple(results.experiment.configurations))
-        braking = results.experiment.braking
-        braked_for = _CONFLICT if braking is not None and braking.brakes_for == "conflict" else _OBJECT
-        lost = sum(
-            _panel(axes, table, column, names, looks, "conflict" in table and column == braked_for)
-            for axes, column in zip(panels, columns, strict=True)
+    names, braking = results.chosen(configurations), results.experiment.braking
+    tally = results.tally[results.tally["configuration"].isin(names)]
+    events = [event for event in _COLUMNS if (tally["event"] == event).any()]
+    known = tally[tally["event"] == DETECTED]
+    top_m = float(np.nanmax(tally["distance_at_detection_m"].to_numpy(dtype=float), initial=1.0))
+    # A driver that brakes for the one event has no verdict at the distance of the other.
+    judged = None if braking is None else CONFLICT if braking.brakes_for == "conflict" else DETECTED
+    strips = {
+        (event, name): Strip.of(
+            tally[(tally["event"] == event) & (tally["configuration"] == name)], top_m / _BINS, judged=event == judged
         )
-        _strips(panels, names, table)
-        shown = [kind for kind in (PASS, FAIL, NEUTRAL) if (verdicts(table) == kind).any()]
-        if "conflict" in table and len(shown):
-            _legend(figure, shown)
+        for event in events
+        for name in names
+    }
+    points = _placed(results, strips)
+    with style():
+        figure = new_figure(1.6 + 4.4 * len(events) + 0.6, 1.5 + 0.5 * len(names))
+        panels = figure.subplots(1, len(events), sharex=True, sharey=True, squeeze=False)[0]
+        looks = appearances(tuple(results.experiment.configurations))
+        for axes, event in zip(panels, events, strict=True):
+            mine = {name: (strips[event, name], points[event, name]) for name in names}
+            _panel(axes, event, mine, looks, int(known["runs"].sum()), top_m)
+        _strips(panels, names, known)
+        if braking is not None:
+            many = counts(known).sum(axis=0)
+            _legend(figure, [kind for kind in (PASS, FAIL, NEUTRAL) if many[KINDS.index(kind)]])
+        most = max(int(strip.count.sum(axis=1).max()) for strip in strips.values())
+        lost = sum(strip.lost for strip in strips.values())
         add_note(
             figure,
             [
@@ -71,6 +83,7 @@ def distances_figure(results: Results, *, configurations: Sequence[str] | None =
                 list_rates(results.summary, names),
                 _braking(results),
                 "A point is one object in one run; from centre to centre",
+                f"Of more than {MOST} points at nearly one distance {MOST} are drawn" if most > MOST else "",
                 f"Without a point: {counted(lost, 'detection')} while the truth has a gap" if lost else "",
             ],
         )
@@ -84,7 +97,7 @@ def distances_about(results: Results) -> list[str]:
         "How far apart the centres of object and reference are in truth at the instant of detection, every row a "
         "point. Farther is earlier only while the two approach each other."
     ]
-    if _CONFLICT in results.table:
+    if (results.tally["event"] == CONFLICT).any():
         about.append("Distance when the collision is foreseen: the same at the first list that implies a collision.")
     if braking is not None:
         what = "the detection" if braking.brakes_for == "object" else "the list that implies a collision"
@@ -96,81 +109,73 @@ def distances_about(results: Results) -> list[str]:
     return about
 
 
-def verdicts(table: pd.DataFrame) -> pd.Series:
-    """Of each row (n,): PASS, FAIL, or NEUTRAL where there is no conflict to judge."""
-    if "conflict" not in table:
-        return pd.Series(NEUTRAL, index=table.index)
-    conflict, passed = (table[name].fillna(False).astype(bool) for name in ("conflict", "braking_pass"))
-    return pd.Series(np.where(~conflict, NEUTRAL, np.where(passed, PASS, FAIL)), index=table.index)
+@dataclass(frozen=True)
+class _Points:
+    """Of a strip those that are drawn: how far away, where across, of which of KINDS; (n,) each."""
+
+    distance_m: Float
+    across: Float
+    kind: Int
 
 
-def spread(distance_m: Float, verdict: Sequence[str], width_m: float) -> Float:
-    """Where across the strip each point lies (n,), −1 … 1: those of a bin evenly, as wide as there are many.
-
-    Of a bin the failures come first, then what is not in conflict, then what passes. `width_m`: of a bin.
-    """
-    order = np.array([(FAIL, NEUTRAL, PASS).index(kind) for kind in verdict], dtype=np.int64)
-    cell = np.floor(distance_m / width_m + 0.5).astype(np.int64)
-    ranked = np.lexsort((np.arange(len(cell)), order, cell))
-    _, first, count = np.unique(cell[ranked], return_index=True, return_counts=True)
-    rank = np.arange(len(cell)) - np.repeat(first, count)
-    many = np.repeat(count, count)
-    result = np.empty(len(cell))
-    result[ranked] = (2 * (rank + 0.5) / many - 1) * many / max(count.max(initial=1), 1)
-    return result
+def _placed(results: Results, strips: Mapping[tuple[str, str], Strip]) -> dict[tuple[str, str], _Points]:
+    """The points of strips by event and configuration, log by log."""
+    parts: dict[tuple[str, str], list[tuple[Float, Float, Int]]] = {key: [] for key in strips}
+    before = {key: np.zeros_like(strip.count) for key, strip in strips.items()}
+    for rows in results.each("configuration", *_COLUMNS.values(), "conflict", "braking_pass"):
+        for key, strip in strips.items():
+            mine = rows[(rows["configuration"] == key[1]) & rows[_COLUMNS[key[0]]].notna()]
+            distance_m = mine[_COLUMNS[key[0]]].to_numpy(dtype=float)
+            kind = kinds(mine) if strip.judged else np.full(len(mine), KINDS.index(NEUTRAL))
+            across, drawn = strip.place(distance_m, kind, before[key])
+            parts[key].append((distance_m[drawn], across[drawn], kind[drawn]))
+    return {key: _Points(*map(np.concatenate, zip(*of, strict=True))) for key, of in parts.items()}
 
 
 def _panel(
-    axes: Axes, table: pd.DataFrame, column: str, names: Sequence[str], looks: dict[str, Appearance], judged: bool
-) -> int:
-    """Draw one panel; returns how many rows were known of but have no distance."""
-    top_m = float(np.nanmax(table[[c for c in _WORDS if c in table]].to_numpy(dtype=float), initial=1.0))
-    lost = 0
-    for k, name in enumerate(names):
-        rows = table[table["configuration"] == name]
-        known = rows[_KNOWN[column]].to_numpy(dtype=bool)
-        distance_m = rows[column].to_numpy(dtype=float)
-        placed = known & ~np.isnan(distance_m)
-        lost += int((known & ~placed).sum())
-        # A driver that brakes for the one event has no verdict at the distance of the other.
-        kind = verdicts(rows).to_numpy() if judged else np.full(len(rows), NEUTRAL, dtype=object)
-        across = k - _HALF * spread(distance_m[placed], list(kind[placed]), top_m / _BINS)
-        never = int((~known).sum())
+    axes: Axes,
+    event: str,
+    strips: Mapping[str, tuple[Strip, _Points]],
+    looks: dict[str, Appearance],
+    count: int,
+    top_m: float,
+) -> None:
+    """Draw one panel; `count`: rows in all."""
+    for k, (name, (strip, points)) in enumerate(strips.items()):
         with of_configuration(list(looks).index(name), axes):
-            _points(axes, distance_m[placed], across, kind[placed], looks[name], name, len(table), judged)
-            axes.text(-0.07 * top_m, k, f"{never}", ha="center", va="center_baseline", color=INK if never else FAINT)
+            _points(axes, points, k, looks[name], name, count, strip.judged)
+            colour = INK if strip.never else FAINT
+            axes.text(-0.07 * top_m, k, f"{strip.never}", ha="center", va="center_baseline", color=colour)
     axes.axvspan(-0.14 * top_m, 0, color="0.95", zorder=0)
-    axes.text(-0.07 * top_m, -0.62, _NEVER[column], ha="center", va="bottom", fontsize=7, color="0.3")
+    axes.text(-0.07 * top_m, -0.62, _NEVER[event], ha="center", va="bottom", fontsize=7, color="0.3")
     axes.set_xlim(-0.14 * top_m, 1.04 * top_m)
     axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= 1.04 * top_m])
-    axes.set_xlabel(_WORDS[column])
-    return lost
+    axes.set_xlabel(_WORDS[event])
 
 
-def _points(
-    axes: Axes, distance_m: Float, across: Float, kind: Any, look: Appearance, name: str, count: int, judged: bool
-) -> None:
+def _points(axes: Axes, points: _Points, place: int, look: Appearance, name: str, count: int, judged: bool) -> None:
     size, alpha = (14.0, 0.8) if count <= _FEW else (8.0, 0.6)
     own: dict[str, Any] = {"marker": "o", "color": look.colour, "s": size}
     grey: dict[str, Any] = {"marker": "s", "color": "0.65", "s": 0.6 * size}
     markers = {NEUTRAL: grey if judged else own, PASS: own, FAIL: {"marker": "x", "color": "black", "s": 1.4 * size}}
     for verdict, marker in markers.items():
-        chosen: Bool = kind == verdict
+        chosen = points.kind == KINDS.index(verdict)
         if not chosen.any():
             continue
-        points: dict[str, Any] = {"linewidths": 0.8 if verdict == FAIL else 0, "rasterized": count > _MANY} | marker
+        where = points.distance_m[chosen], (place - _HALF * points.across)[chosen]
+        drawn: dict[str, Any] = {"linewidths": 0.8 if verdict == FAIL else 0, "rasterized": count > _MANY} | marker
         if marker is own and look.edge != look.colour:  # around all of them, not each: they lie close together
             outline = {"color": look.edge, "s": (size**0.5 + 1.2) ** 2, "label": "_outline"}
-            axes.scatter(distance_m[chosen], across[chosen], zorder=1.9, **(points | outline))
-            points["alpha"] = 1.0
-        if verdict == FAIL and points["rasterized"]:  # black in a picture, which stays so on a dark page
+            axes.scatter(*where, zorder=1.9, **(drawn | outline))
+            drawn["alpha"] = 1.0
+        if verdict == FAIL and drawn["rasterized"]:  # black in a picture, which stays so on a dark page
             halo = {"color": "white", "linewidths": 2.4, "label": "_halo", "zorder": 1.95}
-            axes.scatter(distance_m[chosen], across[chosen], **(points | halo))
+            axes.scatter(*where, **(drawn | halo))
         label = f"{name}: {verdict}"
-        axes.scatter(distance_m[chosen], across[chosen], label=label, zorder=2, **({"alpha": alpha} | points))
+        axes.scatter(*where, label=label, zorder=2, **({"alpha": alpha} | drawn))
 
 
-def _strips(panels: Sequence[Axes], names: Sequence[str], table: pd.DataFrame) -> None:
+def _strips(panels: Sequence[Axes], names: Sequence[str], known: pd.DataFrame) -> None:
     short = short_names(names)
     axes = panels[0]
     axes.set_yticks(range(len(names)), [short[name] for name in names])
@@ -180,13 +185,11 @@ def _strips(panels: Sequence[Axes], names: Sequence[str], table: pd.DataFrame) -
         panel.tick_params(axis="y", length=0)
         for k in range(1, len(names)):
             panel.axhline(k - 0.5, color="0.85", linewidth=0.6, zorder=0.5)
-    if "conflict" not in table:
+    if "in_conflict" not in known:
         return
-    kinds = verdicts(table)
     for k, name in enumerate(names):
-        mine = kinds[table["configuration"] == name]
-        judged = mine[mine != NEUTRAL]
-        share = percent(float((judged == PASS).mean())) if len(judged) else "–"
+        failed, _, passed = counts(known[known["configuration"] == name]).sum(axis=0).tolist()
+        share = percent(passed / (passed + failed)) if passed + failed else "–"
         panels[-1].text(1.02, k, share, transform=panels[-1].get_yaxis_transform(), ha="left", va="center_baseline")
     panels[-1].text(
         1.02, -0.62, "pass", transform=panels[-1].get_yaxis_transform(), fontsize=7, color="0.3", va="bottom"

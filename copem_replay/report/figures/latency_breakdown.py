@@ -20,7 +20,7 @@ and recorded units don't tell. With `count_earlier` times may be negative, and n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from copem_replay.results.read import Results
 
+_INSTANTS = ("onset_s", "in_sight_s", *WAY, "captured_s", "detection_s")
 HIDDEN, IN_SIGHT, UNTIL_CAPTURED, LISTED = "hidden", "in sight", "until captured", "listed"
 PROCESSING, TRANSPORT, FUSION, SINCE_CAPTURED = "processing", "transport", "fusion", "since captured"
 STAGES = {
@@ -73,21 +74,34 @@ HATCHES = {
 
 def stages_of(results: Results, names: Sequence[str]) -> dict[str, dict[str, float]]:
     """By configuration the mean seconds of each stage."""
-    table = results.table
-    return {name: stages(table[table["configuration"] == name], results.experiment, name) for name in names}
+    sums: dict[str, dict[str, float]] = {name: {} for name in names}
+    for rows in results.each("configuration", "detected", *_INSTANTS):
+        for name, so_far in sums.items():
+            for stage, of in _sums(rows[rows["configuration"] == name], results.experiment, name).items():
+                so_far[stage] = so_far.get(stage, 0.0) + of
+    return {name: _means(of) for name, of in sums.items()}
+
+
+def how_many(results: Results) -> dict[str, tuple[int, int]]:
+    """Of each configuration in how many rows the object is detected, and how many rows there are."""
+    known = results.known
+    detected = known["runs"].where(known["time_to_detection_s"].notna(), 0).groupby(known["configuration"]).sum()
+    every = known["runs"].groupby(known["configuration"]).sum()
+    return {name: (int(detected[name]), int(every[name])) for name in results.experiment.configurations}
 
 
 def no_stages(results: Results, names: Sequence[str]) -> str | None:
     """The reason why nothing can be drawn; None: it can."""
     if results.experiment.measure.count_earlier:
         return "with count_earlier an object may be known before the clock starts"
-    return None if any(stages_of(results, names).values()) else "nothing was detected"
+    detected = how_many(results)
+    return None if any(detected[name][0] for name in names) else "nothing was detected"
 
 
 def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Mean duration of the stages from the onset to the detection, a bar per configuration."""
     names = results.chosen(configurations)
-    means = stages_of(results, names)
+    means, known = stages_of(results, names), how_many(results)
     looks, short = appearances(tuple(results.experiment.configurations)), short_names(names)
     with style():
         figure = new_figure(8.0, 1.3 + 0.3 * len(names))
@@ -96,8 +110,7 @@ def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] 
         for k, name in enumerate(names):
             with of_configuration(list(looks).index(name), axes):
                 _bar(axes, k, means[name], looks[name].colour)
-                rows = results.table[results.table["configuration"] == name]
-                said = _beside(sum(means[name].values()), int(rows["detected"].sum()), len(rows))
+                said = _beside(sum(means[name].values()), *known[name])
                 axes.text(sum(means[name].values()) + 0.008 * longest_s, k, said, va="center_baseline")
         axes.set_yticks(range(len(names)), [short[name] for name in names])
         axes.tick_params(axis="y", length=0, pad=10)
@@ -139,6 +152,22 @@ def _legend(figure: Figure, there: Sequence[str]) -> None:
 
 def stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
     """Mean seconds of each stage that is known of a configuration's rows; empty where none was detected."""
+    return _means(_sums(rows, experiment, name))
+
+
+def _means(sums: Mapping[str, float]) -> dict[str, float]:
+    """Of sums over the rows, and their number under "" (none: nothing was detected)."""
+    sums = dict(sums)
+    count = sums.pop("", 0.0)
+    if HIDDEN in sums and UNTIL_CAPTURED in sums:  # in some logs in sight, in others never until it was listed
+        sums[HIDDEN] += sums.pop(UNTIL_CAPTURED)
+    # To a nanosecond: 3.9 − 3 is not 0.9.
+    means = {stage: float(np.round(of / count, 9)) + 0.0 for stage, of in sums.items()}
+    return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in (LISTED, PROCESSING)}
+
+
+def _sums(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, float]:
+    """Of some rows; of one log and another they add up."""
     rows = rows[rows["detected"].astype(bool) & rows["captured_s"].notna()]
     if not len(rows):
         return {}
@@ -160,9 +189,7 @@ def stages(rows: pd.DataFrame, experiment: Experiment, name: str) -> dict[str, f
         result |= {TRANSPORT: arrived_s - sent_s, FUSION: known_s - arrived_s}
     else:
         result |= _since_captured(known_s - captured_s, experiment, name)
-    # To a nanosecond: 3.9 − 3 is not 0.9.
-    means = {stage: float(np.round(values.mean(), 9)) + 0.0 for stage, values in result.items()}
-    return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in (LISTED, PROCESSING)}
+    return {"": float(len(rows))} | {stage: float(values.sum()) for stage, values in result.items()}
 
 
 def _since_captured(delay_s: Float, experiment: Experiment, name: str) -> dict[str, Float]:

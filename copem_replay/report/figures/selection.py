@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ _COLUMNS = 4
 """Runs side by side unless configurations are named (chosen: the paper's)."""
 MOST_LINES = 12
 """Configurations in one plot, at most (chosen: more cannot be told apart)."""
+_RANKED_BY = ("time_to_detection_s", "onset_s", "ended_s", "conflict", "braking_pass")
 _NAMED = 12
 """Ids named in an error (chosen)."""
 
@@ -56,25 +58,35 @@ def choose(results: Results, of: Selection) -> Choice:
 
     Raises InputError for what is not among the results.
     """
-    rows, where = results.table, f"{results.folder}"
+    known = results.known
     for key, column, wanted in (("log", "log", of.log), ("object", "object_id", of.object_id)):
         if wanted is not None:
-            known = list(dict.fromkeys(rows[column]))
-            rows = rows[rows[column] == wanted]
-            if not len(rows):
-                there = ", ".join(map(str, known[:_NAMED])) + (", …" if len(known) > _NAMED else "")
-                raise InputError(f"{where}: {key}: expected one of {there}; found {wanted!r}")
+            there = list(dict.fromkeys(known[column]))
+            known = known[known[column] == wanted]
+            if not len(known):
+                some = ", ".join(map(str, there[:_NAMED])) + (", …" if len(there) > _NAMED else "")
+                raise InputError(f"{results.folder}: {key}: expected one of {some}; found {wanted!r}")
     named = results.chosen(of.configurations)
-    # Of each row the run of its log that is in the .rrd, else the first.
-    shown_run = rows["log"].map(results.provenance.run_shown).fillna(rows["run"].min()).astype(int)
-    of_run = rows[rows["run"] == (shown_run if of.run is None else of.run)]
-    if not len(of_run):
-        raise InputError(f"{where}: run: expected {rows['run'].min()} to {rows['run'].max()}, found {of.run}")
+    of_run = _of_run(results, known, of.run)
     log, object_id = most_telling(of_run, truths(results))
-    rows = rows[(rows["log"] == log) & (rows["object_id"] == object_id)]
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
-    shown = named if of.configurations else worst_to_best(rows, named)
+    (rows,) = results.each("object_id", "configuration", *_RANKED_BY, log=log)
+    shown = named if of.configurations else worst_to_best(rows[rows["object_id"] == object_id], named)
     return Choice(log, object_id, run, shown, bool(of.configurations))
+
+
+def _of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.DataFrame:
+    """Of the logs and objects in `known` the rows of a run; None: of that of each log that is in the .rrd, else 0."""
+    found = []
+    for log in dict.fromkeys(known["log"]):
+        (rows,) = results.each("object_id", "configuration", "run", *_RANKED_BY, log=log)
+        rows = rows[rows["object_id"].isin(known.loc[known["log"] == log, "object_id"])]
+        wanted = results.provenance.run_shown.get(log, 0) if run is None else run
+        found.append(rows[rows["run"] == wanted].assign(log=log))
+    of_run = pd.concat(found)
+    if not len(of_run):
+        raise InputError(f"{results.folder}: run: expected 0 to {results.experiment.runs - 1}, found {run}")
+    return of_run
 
 
 def most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, str]:
@@ -107,13 +119,22 @@ def that_differ(results: Results, names: Sequence[str], most: int = MOST_LINES) 
     """
     if len(names) <= most:
         return tuple(names)
-    keys = ["log", "object_id", "run"]
-    times = results.table.set_index([*keys, "configuration"])["time_to_detection_s"].unstack("configuration").round(6)
+    told = {name: blake2b() for name in names}
+    for times_s in by_run(results, "time_to_detection_s"):
+        for name, so_far in told.items():
+            so_far.update(times_s[name].round(6).to_numpy(dtype=float).tobytes())
     first: dict[bytes, str] = {}
-    for name in names:
-        first.setdefault(times[name].to_numpy(dtype=float).tobytes(), name)
+    for name, whole in told.items():
+        first.setdefault(whole.digest(), name)
     kept = evenly(soonest_first(results, list(first.values())), most)
     return tuple(name for name in names if name in kept)
+
+
+def by_run(results: Results, column: str) -> Iterator[pd.DataFrame]:
+    """Of each log a column of times by object and run, of all configurations beside each other; NaN: never."""
+    for rows in results.each("object_id", "run", "configuration", column):
+        times = rows.set_index(["object_id", "run", "configuration"])[column].unstack("configuration")
+        yield times.reindex(columns=list(results.experiment.configurations))
 
 
 def evenly(ranked: Sequence[str], most: int) -> tuple[str, ...]:

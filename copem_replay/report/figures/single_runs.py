@@ -18,7 +18,7 @@ from copem_replay.report.figures.captions import list_rates, short_names
 from copem_replay.report.figures.label_layout import STEP_IN, draw_labels, last_instant, mark
 from copem_replay.report.figures.selection import Choice, Selection, choose, left_out
 from copem_replay.report.figures.style import FAINT, INK, Appearance, add_note, appearances, new_figure, style
-from copem_replay.report.figures.timeline import Story, row_of, story
+from copem_replay.report.figures.timeline import Story, story
 from copem_replay.report.figures.trajectories import braked_course, free_course
 from copem_replay.results.reread import reread
 
@@ -43,8 +43,11 @@ def runs_figure(results: Results, of: Selection) -> Figure:
     """
     choice = choose(results, of)
     replay = reread(results, choice.log, choice.object_id)
-    rows = [row_of(results.table, choice.log, choice.object_id, choice.run, name) for name in choice.configurations]
-    stories = [story(replay, results.experiment, row) for row in rows]
+    (rows,) = results.each(log=choice.log)
+    of_run = rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)].set_index(
+        "configuration", drop=False
+    )
+    stories = [story(replay, results.experiment, of_run.loc[name]) for name in choice.configurations]
     with style():
         figure = _drawn(results, replay, stories)
         add_note(figure, _note(results, choice, stories))
@@ -138,7 +141,7 @@ def _share(axes: Axes, told: Story, results: Results, replay: Replay, look: Appe
 
 def _note(results: Results, choice: Choice, stories: Sequence[Story]) -> list[str]:
     experiment, braking = results.experiment, results.experiment.braking
-    kind = results.table.loc[results.table["object_id"] == choice.object_id, "object_class"].iloc[0]
+    kind = results.known.loc[results.known["object_id"] == choice.object_id, "object_class"].iloc[0]
     thin = ""
     if braking is not None and any(told.encounter is not None for told in stories):
         course = "as recorded" if braking.ego == "recorded" else "with constant speed from the onset"

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
@@ -50,12 +49,6 @@ class Story:
     encounter: Encounter | None
     events: tuple[Event, ...]  # in order
     result: str
-
-
-def row_of(table: pd.DataFrame, log: str, object_id: str, run: int, configuration: str) -> Any:
-    """One row of `detections.parquet`."""
-    rows = table[(table["log"] == log) & (table["object_id"] == object_id) & (table["run"] == run)]
-    return next(rows[rows["configuration"] == configuration].itertuples(index=False))
 
 
 def story(replay: Replay, experiment: Experiment, row: Any) -> Story:

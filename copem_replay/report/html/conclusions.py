@@ -17,7 +17,7 @@ from copem_replay.report.html.headers import signed_difference
 from copem_replay.report.html.markup import Html, joined, listed, tag, text
 from copem_replay.report.html.setup import some, together
 from copem_replay.report.html.study import Study
-from copem_replay.report.html.ties import as_soon_as_the_best, at_once, why_no_interval
+from copem_replay.report.html.ties import at_once, why_no_interval
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.tables import NOTHING
@@ -74,7 +74,7 @@ def _soonest(study: Study) -> Html:
         alone = "it is the only configuration" if len(study.names) == 1 else "only the ground truth is beside it"
         return joined([name, f" detects after {plain(mean_s)} s on average{counted_as}. There is nothing to compare "
                        f"it with: {alone}."])  # fmt: skip
-    same = as_soon_as_the_best(study)
+    same = study.as_soon
     if len(same) == 1:
         return _first(study, name, mean_s, counted_as)
     _, alike, sooner, unsure = _told_apart(study.lead)
@@ -105,7 +105,7 @@ def _missing(study: Study, unsure: pd.DataFrame) -> str:
     if not len(unsure):
         return ""
     assert study.lead is not None
-    same = as_soon_as_the_best(study)
+    same = study.as_soon
     every = all(rows["configuration"].isin(same).all() for rows in _told_apart(study.lead)[:3])
     apart = unsure[unsure["difference"].abs() > NOTHING]
     of = "" if every else f" of the difference to {together(list((apart if len(apart) else unsure)['configuration']))}"
@@ -148,7 +148,7 @@ def _others(study: Study) -> Iterator[str]:
     """The others by whether their difference to the best can be told from none."""
     if study.lead is None:
         return
-    same = as_soon_as_the_best(study)
+    same = study.as_soon
     later, alike, sooner, unsure = (rows[~rows["configuration"].isin(same)] for rows in _told_apart(study.lead))
     unsure = unsure[unsure["difference"].abs() > NOTHING]
     if len(later):

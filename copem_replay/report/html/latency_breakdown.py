@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from copem_replay.report.figures.captions import plain
-from copem_replay.report.figures.latency_breakdown import STAGES, stages_of
+from copem_replay.report.figures.latency_breakdown import STAGES, how_many, stages_of
 from copem_replay.report.html.markup import Html, folded, joined, table, tag
 from copem_replay.report.html.tables import full, named
 
@@ -15,11 +15,9 @@ if TYPE_CHECKING:
 
 def stage_table(study: Study) -> Html:
     """What the stages are, and their means."""
-    table = study.results.table
     means = stages_of(study.results, study.names)
     there = [stage for stage in STAGES if any(stage in of for of in means.values())]
-    rows = {name: table[table["configuration"] == name] for name in study.names}
-    known = {name: (int(of["detected"].sum()), len(of)) for name, of in rows.items()}
+    known = how_many(study.results)
     about = (
         "Means over the rows in which the object is detected; how many these are, where not all, is beside the bar. "
         "Rows without detection have no stages, so bars of configurations that miss many objects are over other rows, "

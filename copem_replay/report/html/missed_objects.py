@@ -22,13 +22,13 @@ _OPEN = 40
 
 def never_detected(study: Study) -> Html:
     """A row for each object and each set of configurations that missed it in as many runs, the most missed first."""
-    table_of = study.results.table
-    missed = misses(table_of)
+    known = study.results.known
+    missed = misses(known)
     if not len(missed):
         return tag("p", "None: every measured object was detected in every run, by every configuration.")
     rows = [_row(study, found, list(names)) for found, names in _together(missed, study.names)]
     things = missed.groupby(["log", "object_id"]).ngroups
-    every = table_of.groupby(["log", "object_id"]).ngroups
+    every = known.groupby(["log", "object_id"]).ngroups
     said = (
         f"{counted(things, 'object')} of the {every} measured, missed in some run by some configuration; the most "
         "missed first. A row names all configurations that miss the object in as many runs."
@@ -78,13 +78,14 @@ def powers(log10: float) -> Html:
     return joined(["10" if mantissa == "1.0" else f"{mantissa}·10", power])
 
 
-def misses(rows: pd.DataFrame) -> pd.DataFrame:
+def misses(known: pd.DataFrame) -> pd.DataFrame:
     """By log, object and configuration in how many runs it was never detected (`missed`), of how many (`runs`)."""
     keys = ["log", "object_id", "configuration"]
-    grouped = rows.assign(missed=~rows["detected"].astype(bool)).groupby(keys, sort=False)
+    missed = known["runs"].where(known["time_to_detection_s"].isna(), 0)
+    grouped = known.assign(missed=missed).groupby(keys, sort=False)
     found = grouped.agg(
         missed=("missed", "sum"),
-        runs=("missed", "size"),
+        runs=("runs", "sum"),
         object_class=("object_class", "first"),
         onset_s=("onset_s", "first"),
         ended_s=("ended_s", "first"),

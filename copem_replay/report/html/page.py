@@ -33,7 +33,7 @@ class _Section:
 
 def page(study: Study) -> str:
     """The whole report as HTML, nothing of which has to be fetched."""
-    measured = len(study.results.table) > 0
+    measured = len(study.results.known) > 0
     sections = [
         _Section("differences-of-it", "Differences", _differences(study)),
         *_figures(study, ("trade_off",)),
@@ -77,7 +77,7 @@ def _figures(study: Study, names: Sequence[str]) -> Iterator[_Section]:
     for name in names:
         kind = FIGURES[name]
         why = "" if kind.needs_recording else kind.missing(study.results, Selection())
-        if why == "" or not len(study.results.table):
+        if why == "" or not len(study.results.known):
             continue
         if why is not None:
             yield _Section(f"section-{name}", kind.title, [tag("p", f"No figure: {why}.")])

@@ -64,8 +64,8 @@ def question(study: Study) -> str:
 def setting(study: Study) -> str:
     """How it was measured: rows, and when the clock starts."""
     results = study.results
-    things = results.table.groupby(["log", "object_id"]).ngroups if len(results.table) else 0
-    rows = len(results.table) // len(study.names)
+    things = results.known.groupby(["log", "object_id"]).ngroups
+    rows = int(results.known["runs"].sum()) // len(study.names)
     confirm = results.experiment.measure.confirm
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (

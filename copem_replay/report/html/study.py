@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.core.text import unknown
 from copem_replay.report.figures.contenders import RANKED_BY, contenders, default_baseline, soonest_first
 from copem_replay.report.figures.style import Appearance, appearances
+from copem_replay.report.html.ties import as_soon_as
 from copem_replay.results.compare import Comparison, compare
 from copem_replay.results.read import Results, load_results
 
@@ -56,6 +58,11 @@ class Study:
         """How each configuration is drawn."""
         return appearances(self.names)
 
+    @cached_property
+    def as_soon(self) -> tuple[str, ...]:
+        """The best and all other contenders that detect the same objects in the same runs, each at the same time."""
+        return as_soon_as(str(self.best), self.contenders, self.results)
+
     def of(self, name: str) -> pd.Series:
         """The row of `summary.csv` of a configuration."""
         return self.results.summary.set_index("configuration").loc[name]
@@ -71,7 +78,7 @@ def load_study(folder: Path, baseline: str | None = None) -> Study:
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:
         raise InputError(f"--baseline: {unknown('configuration', baseline, names)}")
-    if not len(results.table):
+    if not len(results.known):
         return Study(results, None, None, None, None)
     ranked = contenders(results)
     best = soonest_first(results, ranked)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -10,35 +11,36 @@ from copem_replay.core.tracks import SAME_INSTANT_NS
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.intervals import clusters
 from copem_replay.report.figures.captions import few_in_words
+from copem_replay.report.figures.selection import by_run
 from copem_replay.results.compare.limits import ALL_ALIKE
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import Study
+    from copem_replay.results.read import Results
 
 _SAME_S = SAME_INSTANT_NS * 1e-9
 
 
-def as_soon_as_the_best(study: Study) -> tuple[str, ...]:
-    """The best and all other contenders that detect the same objects in the same runs, each at the same time."""
-    keys = ["log", "object_id", "run"]
-    times = study.results.table.set_index([*keys, "configuration"])["detection_s"].unstack("configuration")
-    best = times[study.best]
-
-    def same(name: str) -> bool:
-        return bool((((times[name] - best).abs() <= _SAME_S) | (times[name].isna() & best.isna())).all())
-
-    return tuple(name for name in study.contenders if name == study.best or same(name))
+def as_soon_as(best: str, names: Sequence[str], results: Results) -> tuple[str, ...]:
+    """Those that detect the same objects in the same runs as the best, each at the same time, and the best itself."""
+    same = dict.fromkeys(names, True)
+    for times_s in by_run(results, "detection_s"):
+        of_best = times_s[best]
+        for name in same:
+            alike = ((times_s[name] - of_best).abs() <= _SAME_S) | (times_s[name].isna() & of_best.isna())
+            same[name] &= name == best or bool(alike.all())
+    return tuple(name for name in names if same[name])
 
 
 def at_once(study: Study) -> bool:
     """Whether the best detects every object, in every run, at its onset."""
-    rows = study.results.table[study.results.table["configuration"] == study.best]
-    return bool((rows["time_to_detection_s"].abs() <= _SAME_S).all())
+    known = study.results.known
+    return bool((known.loc[known["configuration"] == study.best, "time_to_detection_s"].abs() <= _SAME_S).all())
 
 
 def why_no_interval(study: Study, rows: pd.DataFrame) -> str:
     """`2 objects`, `each is the same in every run`: why differences to the best have none."""
-    over = clusters(study.results.table)[0]
+    over = clusters(study.results.known)[0]
     kinds = list(rows["interval"].dropna().unique()) if "interval" in rows else []
     said = []
     if ALL_ALIKE in kinds:

@@ -1,0 +1,133 @@
+"""Figures and report of many rows: made of counts, or log by log; never of all of `detections.parquet` at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from copem_replay.metrics.intervals import clusters
+from copem_replay.metrics.tally import DETECTED, tally
+from copem_replay.report import write_report
+from copem_replay.report.figures import Selection
+from copem_replay.report.figures.bands import mean_limits
+from copem_replay.report.figures.detection_curves import curve_of, endings
+from copem_replay.report.figures.latency_breakdown import how_many, stages, stages_of
+from copem_replay.report.figures.selection import by_run, that_differ
+from copem_replay.report.figures.write import write_figures
+from copem_replay.report.html.missed_objects import misses
+from copem_replay.results.read import Results, load_results
+from tests.helpers.report_pages import changed, eighteen, replayed
+
+LOGS = "logs: [drive.mcap]"
+LOSSY = "{kind: radio, latency: 0.25, reception: {kind: constant, probability: 0.5}}"
+RADIO = ("late: {units: [ego], latency_s: 0.5}", f"late: {{units: [weak], link: {LOSSY}}}")
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three logs, of two objects each; some lists come by a link."""
+    logs = [f"drive{k}.mcap" for k in range(3)]
+    return replayed(tmp_path_factory.mktemp("several"), changed((LOGS, f"logs: [{', '.join(logs)}]"), RADIO), *logs)
+
+
+def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def whole(results: Results) -> Any:
+        raise AssertionError("all rows at once")
+
+    most: list[int] = []
+    each = Results.each
+
+    def watched(results: Results, *columns: str, log: str | None = None) -> Any:
+        for rows in each(results, *columns, log=log):
+            most.append(len(rows))
+            yield rows
+
+    monkeypatch.setattr(Results, "table", property(whole))
+    monkeypatch.setattr(Results, "each", watched)
+    assert write_report(several, tmp_path / "r.html").exists()
+    files, notes = write_figures(load_results(several), tmp_path / "figures", Selection())
+    assert ({path.stem for path in files}, notes) == (
+        {"answer", "differences", "runs", "curves", "distances", "latency_breakdown"}, []
+    )  # fmt: skip
+    # Of each log five configurations × six runs × two objects.
+    assert set(most) == {60}
+
+
+def test_log_by_log_they_are_as_of_all_rows(several: Path) -> None:
+    """What goes log by log, against the whole table."""
+    results = load_results(several)
+    table = results.table
+    names = tuple(results.experiment.configurations)
+    of_all = {name: stages(table[table["configuration"] == name], results.experiment, name) for name in names}
+    found = stages_of(results, names)
+    assert found == {name: pytest.approx(of, abs=2e-9) for name, of in of_all.items()}
+    assert any(len(of) > 4 for of in found.values()), "the way of lists that come by a link"
+    detected = table.groupby("configuration")["detected"].agg(["sum", "size"])
+    assert how_many(results) == {name: tuple(detected.loc[name]) for name in names}
+    keys = ["log", "object_id", "run"]
+    times = table.set_index([*keys, "configuration"])["detection_s"].unstack("configuration")[list(names)]
+    np.testing.assert_array_equal(np.concatenate(list(by_run(results, "detection_s"))), times.to_numpy())
+
+
+def test_those_that_differ_in_one_log_alone(tmp_path: Path) -> None:
+    """Of eighteen configurations the same are drawn of two logs as of the whole table's times."""
+    text = eighteen().replace(LOGS, "logs: [drive0.mcap, drive1.mcap]")
+    results = load_results(replayed(tmp_path, text, "drive0.mcap", "drive1.mcap"))
+    names = tuple(results.experiment.configurations)
+    table = results.table.set_index(["log", "object_id", "run", "configuration"])["time_to_detection_s"]
+    times = table.unstack("configuration").round(6)
+    alike = {name: next(one for one in names if times[one].equals(times[name])) for name in names}
+    assert set(that_differ(results, names)) <= set(alike.values())
+    assert set(that_differ(results, names, most=len(set(alike.values())))) == set(alike.values())
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> pd.DataFrame:
+    """Rows of one configuration: a few instants, many ties, some never, of the objects of some logs."""
+    logs, things, runs = draw(st.integers(1, 6)), draw(st.integers(1, 6)), draw(st.integers(1, 6))
+    index = pd.MultiIndex.from_product(
+        [[f"log {k}" for k in range(logs)], range(runs), [f"{k}" for k in range(things)]],
+        names=["log", "run", "object_id"],
+    )
+    rows = index.to_frame(index=False).assign(configuration="A", object_class="car", onset_s=1.0)
+    steps = draw(st.lists(st.integers(-2, 12), min_size=len(rows), max_size=len(rows)))
+    rows["time_to_detection_s"] = [step / 4 if step <= 8 else np.nan for step in steps]
+    ends = draw(st.lists(st.sampled_from(["object_left", "log_end"]), min_size=logs * things, max_size=logs * things))
+    episode = rows.groupby(["log", "object_id"], sort=False).ngroup()
+    rows["ended_by"], rows["ended_s"] = np.array(ends, dtype=object)[episode], 3.0 + 0.25 * (episode % 5)
+    rows["detected"] = rows["time_to_detection_s"].notna()
+    rows["detection_s"] = rows["onset_s"] + rows["time_to_detection_s"]
+    rows["distance_at_detection_m"] = 50 - rows["detection_s"]
+    return rows
+
+
+@given(tables())
+@settings(max_examples=60, deadline=None)
+def test_counts_say_what_rows_say(rows: pd.DataFrame) -> None:
+    """The same curve to the last bit, the same bands, limits of the mean, and objects that are missed."""
+    found = tally(rows)
+    counted = found[found["event"] == DETECTED]
+    each = rows.assign(runs=1)
+    assert counted["runs"].sum() == len(rows)
+    over = clusters(counted)[0]
+    banded = over in ("logs", "objects")
+    # Of one object runs are resampled, for which the tally is not taken.
+    one, all_ = (curve_of(of, clusters(of)[1] if banded else None, 1) for of in (counted, each))
+    for name in ("times_s", "share", *(("low", "high") if banded and len(one.times_s) else ())):
+        np.testing.assert_array_equal(getattr(one, name), getattr(all_, name))
+    if banded:
+        limits = []
+        for of in (counted, each):
+            time_s, ending, runs = endings(of)
+            limits.append(mean_limits(time_s, ending, list(clusters(of)[1]), 4.0, 1, runs))
+        assert (limits[0] is None) == (limits[1] is None)
+        assert limits[0] is None or limits[0] == pytest.approx(limits[1], abs=1e-9)
+    columns = ["log", "object_id", "missed", "runs", "ended_s", "ended_by"]
+    by_name = [misses(of)[columns].sort_values(["log", "object_id"]).to_numpy().tolist() for of in (counted, each)]
+    assert by_name[0] == by_name[1]
