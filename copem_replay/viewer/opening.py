@@ -49,21 +49,21 @@ def opening_s(folder: Path, files: Sequence[Path]) -> dict[Path, float]:
     Half a second before the earliest onset among the objects of interest. A recording of no known run, or without an
     onset, is left out: it opens at its beginning.
     """
+    found = {}
     try:
         results = open_results(folder)
         runs = _runs_of(results)
-        table = results.table
-        truths = [name for name in results.truth if name in set(table["configuration"])]
+        truths = [name for name in results.truth if name in results.rows.configurations]
+        for path in files:
+            stem = _PART.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
+            if stem in runs:
+                log, run = runs[stem]
+                (rows,) = results.each(log=log)
+                onset_s = _first_onset_s(rows[rows["run"] == run], truths)
+                if onset_s is not None:
+                    found[path] = max(0.0, onset_s - BEFORE_ONSET_S)
     except (CopemError, KeyError, TypeError):
         return {}  # a recording can be seen without tables beside it
-    found = {}
-    for path in files:
-        stem = _PART.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
-        if stem in runs:
-            log, run = runs[stem]
-            onset_s = _first_onset_s(table[(table["log"] == log) & (table["run"] == run)], truths)
-            if onset_s is not None:
-                found[path] = max(0.0, onset_s - BEFORE_ONSET_S)
     return found
 
 

@@ -151,8 +151,8 @@ def _side(results: Results, wanted: Sequence[Named], log: str, run: int) -> _Sid
     kept = {name: configuration for name, configuration in alone.configurations.items() if name in labels}
     experiment = alone.model_copy(update={"configurations": kept, "sweep": None})
     one = one_run(read_again(results, log, experiment), experiment, run)
-    of_run = results.table[(results.table["log"] == log) & (results.table["run"] == run)]
-    rows = of_run[of_run["configuration"].isin(list(kept))]
+    (every,) = results.each(log=log)
+    rows = every[(every["run"] == run) & every["configuration"].isin(list(kept))].assign(log=log)
     again = replay_block(one.replay, one.experiment, np.array([run]))
     keys = ["configuration", "object_id"]
     times = [table.set_index(keys)["detection_s"].sort_index() for table in (rows, again)]

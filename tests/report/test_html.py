@@ -35,6 +35,7 @@ from copem_replay.report.figures.latency_breakdown import (
     UNTIL_CAPTURED,
     stages,
 )
+from copem_replay.report.figures.selection import choose
 from copem_replay.report.figures.style import new_figure, style
 from copem_replay.report.figures.write import write_figures
 from copem_replay.report.html.markup import Html, tag
@@ -256,6 +257,10 @@ class TestWords:
         assert lines[3].startswith("half is ranked last: some logs lack the units, and means and shares are over")
         assert any(line.startswith("Sooner by pairs, without an interval: half (−") for line in lines)
         assert not any(line.startswith("Later") and "half" in line for line in lines)
+        results = load_results(folder)
+        assert set(choose(results, Selection(log="two")).configurations) == {"GT", "late", "hit", "never"}
+        with pytest.raises(InputError, match="log two has none of the units of half; choose another log"):
+            choose(results, Selection(("half",), log="two"))
         note = "configuration half: none of its units in 1 of 2 logs (two), and left out there"
         assert any(note in line for line in whole.words.splitlines())
 

@@ -61,16 +61,19 @@ def choose(results: Results, of: Selection) -> Choice:
     known = results.known
     for key, column, wanted in (("log", "log", of.log), ("object", "object_id", of.object_id)):
         if wanted is not None:
-            there = list(dict.fromkeys(known[column]))
+            every = list(dict.fromkeys(known[column]))
             known = known[known[column] == wanted]
             if not len(known):
-                some = ", ".join(map(str, there[:_NAMED])) + (", …" if len(there) > _NAMED else "")
+                some = ", ".join(map(str, every[:_NAMED])) + (", …" if len(every) > _NAMED else "")
                 raise InputError(f"{results.folder}: {key}: expected one of {some}; found {wanted!r}")
-    named = results.chosen(of.configurations)
+    asked = results.chosen(of.configurations)
     of_run = _of_run(results, known, of.run)
     log, object_id = most_telling(of_run, truths(results))
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
     (rows,) = results.each("object_id", "configuration", *_RANKED_BY, log=log)
+    named = tuple(name for name in asked if (rows["configuration"] == name).any())
+    if not named:
+        raise InputError(f"{results.folder}: log {log} has none of the units of {', '.join(asked)}; choose another log")
     shown = named if of.configurations else worst_to_best(rows[rows["object_id"] == object_id], named)
     return Choice(log, object_id, run, shown, bool(of.configurations))
 

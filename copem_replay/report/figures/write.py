@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,8 @@ def write_figures(results: Results, folder: Path | None, selection: Selection) -
     are there already are replaced, and go where they can no longer be made. Raises InputError for what is not among the
     results, OutputError where nothing can be written.
     """
-    choose(results, selection)  # refused before anything is drawn
+    choice = choose(results, selection)  # refused before anything is drawn
+    selection = replace(selection, log=choice.log, object_id=choice.object_id, run=choice.run)
     folder = results.folder / "figures" if folder is None else folder
     notes: list[str] = []
     files: list[str] = []
