@@ -192,7 +192,10 @@ def commands() -> Iterator[dict[str, object]]:
 
 
 def reports() -> Iterator[dict[str, object]]:
-    """Seconds of `copem-replay report` on the sample (6 configurations) and the crossing (18), kilobytes of each."""
+    """Seconds of `copem-replay report` on the sample (6 configurations) and the crossing (18), kilobytes of each.
+
+    And of `report` and `plot` on 4 and 40 names of the sample's log, 70,000 rows each, with the most memory.
+    """
     tool = [sys.executable, "-m", "copem_replay.cli.main"]
     with _scratch() as folder:
         for name, key in (("tc016d", "report"), ("crossing", "report_18")):
@@ -202,6 +205,16 @@ def reports() -> Iterator[dict[str, object]]:
             command = [*tool, "report", str(out)]
             seconds = best(lambda command=command: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 3)
             yield {f"{key}_s": round(seconds, 2), f"{key}_kb": round((out / "report.html").stat().st_size / 1000)}
+        for k in range(40):
+            shutil.copy(ROOT / "logs/tc016d.mcap", folder / f"{k:02}.mcap")
+        for names in ("0[0-3].mcap", "*.mcap"):
+            text = NAMES.replace("*.mcap", names).replace("runs: 64", "runs: 5000")
+            (folder / "rows.yaml").write_text(text.replace("{alone", "{late: {units: [ego], latency_s: 0.3}, alone"))
+            _spent(["run", str(folder / "rows.yaml"), "--overwrite", "--out", str(folder / "rows")])
+            rows = pd.read_csv(folder / "rows/logs.csv")["rows"].sum()
+            for command in ("report", "plot"):
+                spent = _spent([command, str(folder / "rows")])
+                yield {f"{command}_rows": int(rows), "seconds": round(spent.seconds, 1), "peak_mb": spent.peak_mb}
 
 
 def fusion() -> Iterator[dict[str, object]]:

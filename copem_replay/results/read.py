@@ -88,13 +88,7 @@ class Results:
     @cached_property
     def table(self) -> pd.DataFrame:
         """`detections.parquet` as a whole, for users: figures take `known` or `each`, whatever its size."""
-        return self._frame("detections.parquet", self.columns)
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Columns of `detections.parquet` that are needed."""
-        braking, conflict = self.experiment.braking, self.experiment.measure.conflict
-        return tuple(ROWS | (BRAKING if braking else {}) | (CONFLICT if conflict else {}))
+        return self._frame("detections.parquet", _columns(self.experiment))
 
     @cached_property
     def rows(self) -> LogRows:
@@ -275,7 +269,7 @@ def _check_there(folder: Path, *names: str) -> None:
 
 
 def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
-    """Read a results folder whole, without rows only if `rowless`.
+    """Read a results folder, without rows only if `rowless`.
 
     Raises InputError, one line: no such folder, no results, or damaged ones.
     """
@@ -283,10 +277,10 @@ def load_results(folder: Path | str, *, rowless: bool = False) -> Results:
 
 
 def complete(results: Results, *, rowless: bool = False) -> Results:
-    """The same, with every table read and held against the experiment. Raises InputError."""
+    """The same, with rows held against the experiment, and every other table read. Raises InputError."""
     _check_there(results.folder, "summary.csv", "tally.parquet")
     experiment, rows = results.experiment, results.rows
-    if missing := [name for name in results.columns if name not in rows.kinds]:
+    if missing := [name for name in _columns(experiment) if name not in rows.kinds]:
         raise InputError(f"{rows.place}: expected the column {missing[0]}, found none; {AGAIN}")
     if rows.where or not rowless:
         _check(rows, experiment)
@@ -305,6 +299,12 @@ def complete(results: Results, *, rowless: bool = False) -> Results:
     for name in ("summary", "exact", "sweep"):
         getattr(results, name)
     return results
+
+
+def _columns(experiment: Experiment) -> tuple[str, ...]:
+    """Columns that `detections.parquet` has to have."""
+    conflict = experiment.measure.conflict
+    return tuple(ROWS | (BRAKING if experiment.braking else {}) | (CONFLICT if conflict else {}))
 
 
 def _check(rows: LogRows, experiment: Experiment) -> None:

@@ -49,3 +49,15 @@ def test_tables_of_other_results_are_refused(folder: Path, tmp_path: Path) -> No
     with pytest.raises(InputError, match="other results took its place while it was read; do it once more"):
         _ = found.rows_of("a")
     assert found.source.data["version"] == 1, "what was read before"
+
+
+def test_rows_are_counted_and_given_log_by_log(tmp_path: Path) -> None:
+    rows = [row("ideal", 1.0), row("late", 2.0), row("late", None, run=1), row("late", 3.0, log="b")]
+    found = open_results(write_folder(tmp_path / "made", rows))
+    assert found.rows.counts == {("a", "ideal"): 1, ("a", "late"): 2, ("b", "late"): 1}
+    assert found.rows.configurations == ("ideal", "late")
+    first, second = found.each("detection_s", "brake_s", "run")
+    assert list(first) == ["detection_s", "run"], "what there is of the columns"
+    assert (first["detection_s"].to_list()[:2], second["detection_s"].to_list()) == ([1.0, 2.0], [3.0])
+    (only,) = found.each(log="b")
+    assert (only["configuration"].to_list(), "log" in only) == (["late"], False)

@@ -21,8 +21,8 @@ AnyResults: TypeAlias = "Results | StudyResult | str | PathLike[str]"
 def load_results(folder: str | PathLike[str]) -> Results:
     """Read a results folder: its experiment and its tables, under the names that `run` gives them.
 
-    `detections`, `summary`, and where the folder has them `exact`, `sweep`, `accuracy` and `bands` (else None): pandas,
-    times in seconds (`_s`), distances in metres (`_m`).
+    `detections`, `tally`, `summary`, and where it has them `exact`, `sweep`, `accuracy`, `bands` (else None): pandas,
+    times in seconds (`_s`), distances in metres (`_m`). Of many rows `each` gives those of a log at a time.
 
     Raises InputError: no such folder, no results in it, or damaged ones.
 
