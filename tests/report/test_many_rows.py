@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,15 @@ from copem_replay.report import write_report
 from copem_replay.report.figures import Selection
 from copem_replay.report.figures.bands import mean_limits
 from copem_replay.report.figures.detection_curves import curve_of, endings
-from copem_replay.report.figures.latency_breakdown import how_many, stages, stages_of
+from copem_replay.report.figures.latency_breakdown import (
+    FUSION,
+    HIDDEN,
+    IN_SIGHT,
+    TRANSPORT,
+    how_many,
+    stages,
+    stages_of,
+)
 from copem_replay.report.figures.selection import by_run, that_differ
 from copem_replay.report.figures.write import write_figures
 from copem_replay.report.html.missed_objects import misses
@@ -73,6 +82,17 @@ def test_log_by_log_they_are_as_of_all_rows(several: Path) -> None:
     keys = ["log", "object_id", "run"]
     times = table.set_index([*keys, "configuration"])["detection_s"].unstack("configuration")[list(names)]
     np.testing.assert_array_equal(np.concatenate(list(by_run(results, "detection_s"))), times.to_numpy())
+
+
+def test_in_sight_in_one_log_alone(several: Path) -> None:
+    """Where it was never in sight until it was listed it was hidden until then, as if all rows were of one log."""
+    experiment = load_results(several).experiment
+    one = pd.DataFrame({"detected": True, "onset_s": 1.0, "captured_s": [3.0, 4.0], "detection_s": [5.0, 7.0]})
+    logs = [one.assign(configuration="half", in_sight_s=sight_s) for sight_s in (2.0, np.nan)]
+    results: Any = SimpleNamespace(experiment=experiment, each=lambda *columns: iter(logs))
+    expected = {HIDDEN: 1.75, IN_SIGHT: 0.75, TRANSPORT: 2.5, FUSION: 0.0}
+    assert stages_of(results, ["half"]) == {"half": expected}
+    assert stages(pd.concat(logs), experiment, "half") == expected
 
 
 def test_those_that_differ_in_one_log_alone(tmp_path: Path) -> None:
