@@ -102,8 +102,9 @@ class Results:
         """Rows log by log, or of one log, with these of the columns; none named: all but the log's name."""
         rows = self.rows.only(columns or [name for name in self.rows.without_rows.column_names if name != "log"])
         for one in self.rows.where if log is None else [log]:
-            yield rows.of(one).to_pandas()
-        check_still(self.folder, self.seen)
+            found = rows.of(one)
+            check_still(self.folder, self.seen)
+            yield found.to_pandas()
 
     @cached_property
     def tally(self) -> pd.DataFrame:
