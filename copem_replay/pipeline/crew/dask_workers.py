@@ -37,6 +37,9 @@ _LOOKS = 1000
 """Among so many tasks one is looked for whose log a worker has in memory (chosen)."""
 _STARTS_S = 60.0
 """So long a scheduler file is waited for: the line before may be starting it (chosen)."""
+_KEEPS_MEMORY = {"MALLOC_MMAP_THRESHOLD_": 1 << 25, "MALLOC_TRIM_THRESHOLD_": 1 << 30}
+"""For workers: as Dask has it what they free goes back to the system at once, and to ask for it again takes a third of
+the time."""
 _LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
 _ADDRESS = re.compile(r"(tcp|tls)://[^/\s]+:[1-9][0-9]{0,4}")
 _TLS = "DASK_DISTRIBUTED__COMM__TLS__"
@@ -285,6 +288,7 @@ def _local(count: int) -> Any:
 
     # A worker that dies again while it starts is started again, however long that takes.
     dask.config.set({"distributed.deploy.lost-worker-timeout": "365 days"})
+    dask.config.set({f"distributed.nanny.pre-spawn-environ.{name}": value for name, value in _KEEPS_MEMORY.items()})
     # Without a dashboard the scheduler still listens for requests about its health; at any port, for 8787 may be taken.
     return distributed.LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address="127.0.0.1:0",

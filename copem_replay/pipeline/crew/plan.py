@@ -52,7 +52,7 @@ def unsurveyed(
 
 
 def missing(experiment: Experiment, logs: Sequence[StudyLog], pieces: Pieces, threads: int) -> list[Task]:
-    """What has to be computed, the largest first."""
+    """What has to be computed: log by log, so that a worker goes on with what it has, the largest first."""
     there = pieces.keys()
     works = {log.name: list(_missing(log, experiment, there)) for log in logs}
     whole_s = sum(Task(_NO_LOG, tuple(work)).about_s for work in works.values())
@@ -63,7 +63,10 @@ def missing(experiment: Experiment, logs: Sequence[StudyLog], pieces: Pieces, th
             entry = next((e for e in experiment.logs if isinstance(e, LogSettings) and e.name == log.name), None)
             of = _log_task(experiment, log.name, log.recording.place, entry, pieces.address)
             tasks += [Task(of, part) for part in _cut(works[log.name], most_s)]
-    return sorted(tasks, key=lambda task: -task.about_s)
+    of_log = dict.fromkeys(works, 0.0)
+    for task in tasks:
+        of_log[task.log.name] += task.about_s
+    return sorted(tasks, key=lambda task: (-of_log[task.log.name], task.log.name, -task.about_s))
 
 
 def _missing(log: StudyLog, study: Experiment, there: Callable[[str], bool]) -> Iterator[Work]:

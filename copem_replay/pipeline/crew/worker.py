@@ -37,6 +37,7 @@ class _Study:
 
     at: tuple[tuple[Experiment, StudyLog], ...] = ()
     refused: tuple[Refused, ...] = ()
+    replayed: bool = False
 
     @property
     def states(self) -> int:
@@ -94,7 +95,7 @@ def _short(version: str) -> str:
 
 _lock = Lock()
 _kept: dict[tuple[LogTask, str], _Study] = {}
-"""Logs that were opened, the last one last, while their files are as they were: what is surveyed is replayed next."""
+"""Logs that were surveyed, while their files are as they were, and the one that is replayed, the last one last."""
 
 
 def _opened(task: Task) -> _Study:
@@ -106,9 +107,11 @@ def _opened(task: Task) -> _Study:
     if study is None or not task.work:  # a survey is asked for because something is not known
         study = _open(task.log)
     with _lock:
-        _kept[log] = study
-        while len(_kept) > 1 and sum(one.states for one in _kept.values()) > STATES_HELD:
+        for known in [known for known, one in _kept.items() if one.replayed]:
+            del _kept[known]
+        while _kept and study.states + sum(one.states for one in _kept.values()) > STATES_HELD:
             del _kept[next(iter(_kept))]
+        _kept[log] = replace(study, replayed=bool(task.work))
     return study
 
 
