@@ -38,8 +38,8 @@ _LOOKS = 1000
 _STARTS_S = 60.0
 """So long a scheduler file is waited for: the line before may be starting it (chosen)."""
 _KEEPS_MEMORY = {"MALLOC_MMAP_THRESHOLD_": 1 << 25, "MALLOC_TRIM_THRESHOLD_": 1 << 30}
-"""For workers: as Dask has it what they free goes back to the system at once, and to ask for it again takes a third of
-the time."""
+"""For workers: as Dask has it what they free goes back to the system at once, and asking for it again was a
+quarter of the time of a study with accuracy. It is read when a process starts, by glibc."""
 _LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
 _ADDRESS = re.compile(r"(tcp|tls)://[^/\s]+:[1-9][0-9]{0,4}")
 _TLS = "DASK_DISTRIBUTED__COMM__TLS__"
