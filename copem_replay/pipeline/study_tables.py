@@ -12,8 +12,8 @@ import pyarrow as pa
 from copem_replay.metrics.way import WAY
 from copem_replay.pipeline.log_tables import LogTables
 
-HELD_ROWS = 5_000_000
-"""Rows of all logs that are in memory at most where they can be read again (chosen: 1 to 2 GB)."""
+HELD_BYTES = 1_000_000_000
+"""So much of all logs is in memory at most where it can be read again (chosen: five million rows without accuracy)."""
 
 
 class StudyTables:
@@ -24,6 +24,7 @@ class StudyTables:
         """Rows by log, in the order in which logs are added."""
         self._again, self._way = again, way
         self._held: dict[str, LogTables] = {}
+        self._bytes = 0
         self._schema: pa.Schema | None = None  # of all rows; None: they are of pandas
         self._last: tuple[str, pd.DataFrame] | None = None
 
@@ -35,7 +36,8 @@ class StudyTables:
             schema = tables.rows.schema.remove_metadata()
             known = [schema] if self._schema is None else [self._schema, schema]
             self._schema = pa.unify_schemas(known, promote_options="permissive")
-        if self._again is not None and sum(self.counts.values()) > HELD_ROWS:
+            self._bytes += sum(one.nbytes for one in (tables.rows, tables.beside, tables.runs) if one is not None)
+        if self._again is not None and self._bytes > HELD_BYTES:
             self._held.clear()
         return self._frame([tables.rows])
 

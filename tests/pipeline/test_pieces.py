@@ -226,7 +226,7 @@ def test_rows_of_one_log_are_in_memory_at_a_time(
     text = text.replace("logs: [a.mcap, b.mcap]", "logs: ['?.mcap']")
     plain, _, _ = replayed(text, "plain", None)
     assert len([name for name in plain if name.startswith("detections.parquet")]) == (4 if many else 1)
-    monkeypatch.setattr(study_tables, "HELD_ROWS", 100)
+    monkeypatch.setattr(study_tables, "HELD_BYTES", 100)
     held: list[int] = []
     of = StudyTables._of
 
