@@ -44,6 +44,7 @@ _LOCAL = re.compile(r"local(:[1-9][0-9]{0,3})?")
 _ADDRESS = re.compile(r"(tcp|tls)://[^/\s]+:[1-9][0-9]{0,4}")
 _TLS = "DASK_DISTRIBUTED__COMM__TLS__"
 _PROBE = "probe.txt"
+_CLOSED = ("closing", "closed")
 _GONE = (OSError, RuntimeError)
 """The scheduler does not answer (a TimeoutError is an OSError), or the client has closed itself for that."""
 
@@ -90,6 +91,9 @@ class DaskWorkers(Workers):
 
     def threads(self) -> int:
         """How many tasks it does at once."""
+        if self._client.status in _CLOSED:  # what it had may never be told of again
+            for mine, _ in [*self._given.values()]:
+                _given_up(mine)
         if self._changed:
             self._changed = False
             with suppress(*_GONE):  # futures say so
@@ -118,14 +122,14 @@ class DaskWorkers(Workers):
         self._given[key] = mine, len(task.keys)
         try:
             given = self._client.submit(_done_at, task, key=key, pure=False)
+            given.add_done_callback(lambda _: self._landed(task, given, mine))
         except Exception:
-            if self._client.status != "closed":
+            if self._client.status not in _CLOSED:
                 raise
             del self._given[key]
             _given_up(mine)
             return mine
         mine.add_done_callback(lambda _: self._let_go(key, given))
-        given.add_done_callback(lambda _: self._landed(task, given, mine))
         return mine
 
     def come_back(self) -> None:
@@ -215,7 +219,9 @@ class DaskWorkers(Workers):
                 self._has[task.log] = at
                 self._idle.append(at)
                 mine.set_result(receipt)
-            except (CancelledError, OSError):  # the scheduler is gone
+            except (CancelledError, *_GONE) as error:
+                if isinstance(error, RuntimeError) and given.status == "error":  # of the worker, not of a closed client
+                    mine.set_exception(error)
                 _given_up(mine)
             except Exception as error:
                 mine.set_exception(error)
