@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import pyarrow as pa
 
+from copem_replay.core.remote import is_url
 from copem_replay.experiment.drive import of_log
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.blocks import Outcome, blocks, outcomes
@@ -32,7 +33,7 @@ _Found = dict[tuple[str, tuple[int, int]], LogTables | None]
 """Pieces of a log by configuration and range of runs; None: it is not there."""
 
 _AT_ONCE = 8
-"""So many pieces are read at once (chosen: of object storage one by one is waiting)."""
+"""So many pieces are read at once of object storage, where one by one is waiting (chosen)."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,8 @@ class Gatherer:
     def _read_ahead(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[tuple[StudyLog, _Found]]:
         """The pieces of each log that are there; those of the next log are read meanwhile."""
         before: tuple[StudyLog, dict[tuple[str, tuple[int, int]], Future[LogTables | None]]] | None = None
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
+        assert self._pieces is not None
+        with ThreadPoolExecutor(_AT_ONCE if is_url(self._pieces.address) else 1) as pool:
             try:
                 for log in logs:
                     reading = {key: pool.submit(*of) for key, of in self._wanted(log, experiment)}

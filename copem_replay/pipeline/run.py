@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -32,6 +32,9 @@ from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.study_log import StudyLog
 from copem_replay.pipeline.study_tables import StudyTables
 from copem_replay.pipeline.sweep import Point, points
+
+ROWS_A_BATCH = 100_000
+"""Rows of logs that are counted together, at least (chosen)."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +142,26 @@ def _gathered(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gather
     """Log by log."""
     tables = gatherer.tables(logs, experiment)
     tallies, totals, sums = list[pd.DataFrame](), dict[tuple[str, str], Total](), dict[str, dict[str, OwnSums]]()
-    for one in gatherer.each(logs, experiment):
-        rows = tables.add(one)
+    for some in _batches(gatherer.each(logs, experiment)):
+        rows = tables.add(some)
         tallies.append(tally(rows))
-        totals |= by_log([one])
-        sums = added(sums, own_sums_of(rows, experiment.measure.metrics))
+        totals |= by_log(some)
+        for _, of in rows.groupby("log", sort=False) if experiment.measure.metrics else ():
+            sums = added(sums, own_sums_of(of, experiment.measure.metrics))
     return _Gathered(tables, pd.concat(tallies, ignore_index=True), totals, sums)
+
+
+def _batches(each: Iterable[LogTables]) -> Iterator[list[LogTables]]:
+    """Tables of logs, so many together that what is done once per batch costs nothing."""
+    some, rows = list[LogTables](), 0
+    for one in each:
+        some.append(one)
+        rows += len(one.rows)
+        if rows >= ROWS_A_BATCH:
+            yield some
+            some, rows = [], 0
+    if some:
+        yield some
 
 
 def check_closed_form(ready: Sequence[Replay], experiment: Experiment) -> None:

@@ -28,18 +28,21 @@ class StudyTables:
         self._schema: pa.Schema | None = None  # of all rows; None: they are of pandas
         self._last: tuple[str, pd.DataFrame] | None = None
 
-    def add(self, tables: LogTables) -> pd.DataFrame:
-        """The tables of one more log. Returns its rows."""
-        self.counts[tables.log] = len(tables.rows)
-        self._held[tables.log] = tables
-        if isinstance(tables.rows, pa.Table):
-            schema = tables.rows.schema.remove_metadata()
-            known = [schema] if self._schema is None else [self._schema, schema]
-            self._schema = pa.unify_schemas(known, promote_options="permissive")
-            self._bytes += sum(one.nbytes for one in (tables.rows, tables.beside, tables.runs) if one is not None)
+    def add(self, some: Sequence[LogTables]) -> pd.DataFrame:
+        """The tables of more logs. Returns their rows."""
+        for tables in some:
+            self.counts[tables.log] = len(tables.rows)
+            self._held[tables.log] = tables
+            self._bytes += sum(one.nbytes for one in (tables.beside, tables.runs) if one is not None)
+        arrow = [tables.rows for tables in some if isinstance(tables.rows, pa.Table)]
+        if arrow:
+            self._bytes += sum(rows.nbytes for rows in arrow)
+            known = [] if self._schema is None else [self._schema]
+            schemas = [*known, *(rows.schema.remove_metadata() for rows in arrow)]
+            self._schema = pa.unify_schemas(schemas, promote_options="permissive")
         if self._again is not None and self._bytes > HELD_BYTES:
             self._held.clear()
-        return self._frame([tables.rows])
+        return self._frame([tables.rows for tables in some])
 
     @cached_property
     def whole(self) -> pd.DataFrame:

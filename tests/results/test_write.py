@@ -250,7 +250,7 @@ def made_up(times: list[float | None]) -> Result:
 
 def of_one_log(rows: pd.DataFrame) -> StudyTables:
     tables = StudyTables()
-    tables.add(LogTables("scene", rows))
+    tables.add([LogTables("scene", rows)])
     return tables
 
 
