@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,7 +61,7 @@ class Result:
         """The rows of `detections.parquet`, of all logs."""
         return self.tables.whole
 
-    @property
+    @cached_property
     def accuracy(self) -> AccuracyTables | None:
         """The tables of all logs, with `measure: {accuracy: true}`."""
         return None if self.bands is None else self.accuracy_of(list(self.tables.each()), self.table)
