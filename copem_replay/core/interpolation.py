@@ -1,8 +1,11 @@
 """States between recorded frames.
 
 A state between two frames of an object is interpolated linearly (yaw the short way round) over at most
-`max_gap_s`; in a longer gap the object is absent, and never is it extended beyond its first or last frame.
+`max_gap_s`; in a longer gap the object is absent, and so it is before its first frame and after its last.
 Within 1 µs of a frame the recorded state itself is taken.
+
+Only where a list states another instant than that of its capture, an object that was there at the capture is there at
+the stated instant, too: its nearest recorded state is moved by its velocity (`at_stated_instants`).
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, VALUES, Bool, Float, Int, Tracks, spliced
 
 _AT_ONCE = 1 << 20
 """States interpolated at a time, for memory's sake (chosen)."""
@@ -48,6 +51,72 @@ def at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) 
         arrives_s=captured_s[None],
         valid=np.ones((1, len(frame)), dtype=bool),
         **columns,
+    )
+
+
+def at_stated_instants(
+    truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], *, t0_ns: int, max_gap_s: float
+) -> Tracks:
+    """The world at instants `stamps_ns (F,)`, ascending, that lists state, whose captures are others.
+
+    `captured_ns`: the earliest and the latest capture (F,) of the lists that state each instant. An object that is
+    there at the capture, but not at the stated instant, has the first state after it moved back by its velocity, or
+    the last state before it moved on, by at most `max_gap_s`. All else is as of `at_instants`.
+    """
+    world = at_instants(truth, stamps_ns, t0_ns=t0_ns, max_gap_s=max_gap_s)
+    if not len(truth.frame_ix):
+        return world
+    row, frame = _beyond_stays(truth, stamps_ns, captured_ns, int(max_gap_s * 1e9))
+    return spliced([world, _moved_states(truth, world, row, frame)])[0] if len(row) else world
+
+
+def _beyond_stays(truth: Tracks, stamps_ns: Int, captured_ns: tuple[Int, Int], max_gap_ns: int) -> tuple[Int, Int]:
+    """Where states are moved: from which rows (K,) of the truth, to which instants (K,), by track and instant."""
+    own_ns = truth.stamp_ns[truth.frame_ix]
+    apart = np.diff(own_ns) > max_gap_ns + SAME_INSTANT_NS
+    apart[truth.start[1:-1] - 1] = True
+    first, last = np.flatnonzero(np.append(True, apart)), np.flatnonzero(np.append(apart, True))
+    earliest_ns, latest_ns = captured_ns
+    found = []
+    for row, from_ns, until_ns in (
+        (first, own_ns[first] - max_gap_ns, own_ns[first] - SAME_INSTANT_NS),
+        (last, own_ns[last] + SAME_INSTANT_NS + 1, own_ns[last] + max_gap_ns + 1),
+    ):
+        begin, after = np.searchsorted(stamps_ns, from_ns), np.searchsorted(stamps_ns, until_ns)
+        counts = np.maximum(after - begin, 0)
+        rows = np.repeat(row, counts)
+        frames = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(begin, counts)
+        back = stamps_ns[frames] < own_ns[rows]
+        there = np.where(
+            back,
+            latest_ns[frames] >= own_ns[rows] - SAME_INSTANT_NS,
+            earliest_ns[frames] <= own_ns[rows] + SAME_INSTANT_NS,
+        )
+        found.append(np.stack([rows[there], frames[there]]))
+    rows, frames = np.concatenate(found, axis=1)
+    # In a gap both of its ends may be near: the nearer one counts, of two as near the earlier.
+    order = np.lexsort((rows, np.abs(stamps_ns[frames] - own_ns[rows]), frames, truth.track_ix[rows]))
+    rows, frames = rows[order], frames[order]
+    track = truth.track_ix[rows]
+    new = (np.diff(track, prepend=-1) != 0) | (np.diff(frames, prepend=-1) != 0)
+    return rows[new], frames[new]
+
+
+def _moved_states(truth: Tracks, world: Tracks, row: Int, frame: Int) -> Tracks:
+    """Rows (K,) of the truth in lists (K,) of the world, by track and list: moved to its instants by their velocity."""
+    values = {name: getattr(truth, name)[:, row] for name in VALUES}
+    elapsed_s = (world.stamp_ns[frame] - truth.stamp_ns[truth.frame_ix[row]]) * 1e-9
+    values["x_m"] = values["x_m"] + values["vx_mps"] * elapsed_s
+    values["y_m"] = values["y_m"] + values["vy_mps"] * elapsed_s
+    track, start = np.unique(truth.track_ix[row], return_index=True)
+    return replace(
+        world,
+        start=np.append(start, len(row)),
+        unit_ix=truth.unit_ix[track],
+        object_ix=truth.object_ix[track],
+        frame_ix=frame,
+        valid=np.ones((1, len(row)), dtype=bool),
+        **values,
     )
 
 

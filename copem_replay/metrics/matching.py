@@ -3,7 +3,8 @@
 An entry *tells of* one instant: of its newest capture, or, where the fusion brings its entries to the present, of the
 instant the list is available (`ListFusion.tells_of`). An object is *within the gate* of an entry when it is there at
 that instant, the horizontal distance of their centres is at most the gate, and their classes agree (`core/agree.py`; of
-the entry the most probable one). In a gap of the truth the object is absent. All true objects of the instant count,
+the entry the most probable one). In a gap of the truth the object is absent; but where a clock states another instant
+than that of the capture, an object that was there at the capture is there. All true objects of the instant count,
 measured or not, moving or not, the ego too: an entry at one of them is no ghost.
 
 1. Every entry belongs to the nearest object within its gate. Of several at one object the *preferred* one is its
@@ -154,9 +155,10 @@ def _each_list(
             _one_list(entries, first, frame[:n], others, rows, agree, gate_m, about)
             if not both:
                 continue
-            late = False
+            # At one instant the truth of both may differ: a clock that is fast tells of an object that has left.
+            there, late = now.bounds[k + 1] - now.bounds[k], False
             for f in frame[:n]:
-                late |= f < 0 or rows.frame_s[f] != now.frame_s[k]
+                late |= f < 0 or rows.frame_s[f] != now.frame_s[k] or rows.bounds[f + 1] - rows.bounds[f] != there
             if late:
                 frame[:n] = k
                 _one_list(entries, first, frame[:n], others, now, agree, gate_m, at_once)

@@ -1,7 +1,8 @@
 """Scoring: how good a configuration's fused lists are.
 
 What is said of an object is matched with the truth at the instant it tells of, what a list is worth now with the truth
-at the instant it was available (`metrics/matching.py`).
+at the instant it was available (`metrics/matching.py`). Where a unit's clock is off, an entry may tell of an instant
+before its object's first frame, or after its last: it is held against the state moved there (`core/interpolation.py`).
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from copem_replay.core.agree import AGREE
-from copem_replay.core.interpolation import AROUND_S, at_instants
-from copem_replay.core.tracks import CLASSES, Bool, Float, Scene, Tracks, class_indices
+from copem_replay.core.interpolation import AROUND_S, at_instants, at_stated_instants
+from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks, class_indices
 from copem_replay.metrics.accuracy.aggregator import Aggregator
 from copem_replay.metrics.accuracy.statistics import Accuracy, Settings, for_runs
 from copem_replay.metrics.config import AnnotatedArea, Measure, MetricsSetup
@@ -60,13 +61,31 @@ class TruthCache:
         """The truth at instants (K,), ascending."""
         return _kept(self._worlds, time_s, self._at)
 
+    def at_stated(self, time_s: Float, captured_s: tuple[Float, Float]) -> Tracks:
+        """The truth at stated instants (K,), ascending; `captured_s`: when what they state was captured, from, to."""
+        return _kept(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
+
     def _at(self, time_s: Float) -> Tracks:
-        stamps = self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
-        gap_s = self.experiment.max_gap_s
-        near = self.truth
-        if len(time_s):
-            near = near.captured_between(time_s[0] - gap_s - AROUND_S, time_s[-1] + gap_s + AROUND_S)
-        return at_instants(near, stamps, t0_ns=self.scene.t0_ns, max_gap_s=gap_s)
+        return at_instants(
+            self._near(time_s), self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
+        )
+
+    def _at_stated(self, times_s: Float) -> Tracks:
+        stamps, earliest, latest = self._stamps(times_s)
+        return at_stated_instants(
+            self._near(times_s[0]), stamps, (earliest, latest), t0_ns=self.scene.t0_ns,
+            max_gap_s=self.experiment.max_gap_s,
+        )  # fmt: skip
+
+    def _stamps(self, time_s: Float) -> Int:
+        return self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
+
+    def _near(self, time_s: Float) -> Tracks:
+        """The truth as far as states at instants (K,) need it."""
+        if not len(time_s):
+            return self.truth
+        gap_s = self.experiment.max_gap_s + AROUND_S
+        return self.truth.captured_between(time_s[0] - gap_s, time_s[-1] + gap_s)
 
     def reference(self, time_s: Float) -> Reference:
         """From where distances are measured, at instants (K,)."""
@@ -108,7 +127,7 @@ class Scores:
 
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
     """Which true object each entry of the fused lists is about, at the instant it tells of."""
-    world = around.at(output.at.issue_s if output.tells_of == "now" else _captures(output))
+    world = around.at(output.at.issue_s) if output.tells_of == "now" else _world_told(around, output)
     return match(output.told, world, around.scene, gate_m=measure.match.gate_m, tells_of=output.tells_of)
 
 
@@ -117,8 +136,16 @@ def _match_both(around: TruthCache, output: ReceiverOutput, measure: Measure) ->
     if output.tells_of == "now":
         matches = match_lists(around, output, measure)
         return matches, matches
-    then, now = around.at(_captures(output)), around.at(output.at.issue_s)
+    then, now = _world_told(around, output), around.at(output.at.issue_s)
     return match_both(output.told, then, now, around.scene, gate_m=measure.match.gate_m)
+
+
+def _world_told(around: TruthCache, output: ReceiverOutput) -> Tracks:
+    """The truth at the captures that entries tell of."""
+    captures_s = _captures(output)
+    if output.stated is None:
+        return around.at(captures_s)
+    return around.at_stated(captures_s, output.stated.captured_between_s(captures_s))
 
 
 def _captures(output: ReceiverOutput) -> Float:

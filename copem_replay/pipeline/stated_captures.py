@@ -35,6 +35,13 @@ class StatedCaptures:
         """How far a stated capture is ahead of the true one, at most; 0 where none is."""
         return float((self.stated_s - self.captured_s).max(initial=0.0))
 
+    def captured_between_s(self, stated_s: Float) -> tuple[Float, Float]:
+        """The earliest and the latest true capture (K,) of the lists that state each instant (K,), one at least."""
+        order = np.lexsort((self.captured_s, self.stated_s))
+        first, after = (np.searchsorted(self.stated_s[order], stated_s, side=side) for side in ("left", "right"))
+        captured_s = self.captured_s[order]
+        return captured_s[first], captured_s[after - 1]
+
     def as_told(self, lists: ObjectLists) -> ObjectLists:
         """The units' lists, one run of F, with stated captures."""
         entries = lists.entries.copy()

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from copem_replay.core.interpolation import at_instants, states_at, wrap
+from copem_replay.core.interpolation import at_instants, at_stated_instants, states_at, wrap
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from tests.helpers.scenes import T0_NS
 
@@ -98,7 +98,13 @@ def at(world: Tracks, t_ns: int, object_ix: int = 0) -> dict[str, float] | None:
 
 def in_lists(world: Tracks, stamps_ns: list[int]) -> list[dict[int, dict[str, float]]]:
     """`at_instants`, list by list: the objects in it and their states."""
-    found = at_instants(world, T0_NS + np.array(stamps_ns, dtype=np.int64), t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    return by_list(
+        at_instants(world, T0_NS + np.array(stamps_ns, dtype=np.int64), t0_ns=T0_NS, max_gap_s=MAX_GAP_S), stamps_ns
+    )
+
+
+def by_list(found: Tracks, stamps_ns: list[int]) -> list[dict[int, dict[str, float]]]:
+    """List by list the objects in it and their states."""
     assert found.stamp_ns.tolist() == [T0_NS + t for t in stamps_ns]
     assert found.captured_s == pytest.approx([t * 1e-9 for t in stamps_ns], abs=1e-12)
     assert np.array_equal(found.arrives_s, found.captured_s[None])
@@ -294,3 +300,83 @@ def test_a_frame_that_one_object_misses_is_filled_at_the_truths_own_instants(ask
     assert found.frame_ix[rows].tolist() == [0, 1, 2, 3]
     assert found.x_m[0, rows] == pytest.approx([0, 1, 2, 3])
     assert (found.row_object_ix == 2).sum() == 4
+
+
+def stated(world: Tracks, told: list[tuple[int, int, int]]) -> list[dict[int, dict[str, float]]]:
+    """`at_stated_instants`, list by list. `told`: the stated instant, the earliest and the latest capture."""
+    stamps, earliest, latest = (T0_NS + np.array(column, dtype=np.int64) for column in zip(*told, strict=True))
+    found = at_stated_instants(world, stamps, (earliest, latest), t0_ns=T0_NS, max_gap_s=MAX_GAP_S)
+    return by_list(found, [at_ns for at_ns, _, _ in told])
+
+
+class TestStatedInstants:
+    def test_the_first_state_moved_back_and_the_last_moved_on(self) -> None:
+        """(50, 8) with (−10, 2) m/s at 1 s, (40, 10) with (−12, 1) m/s at 1.4 s: 40 ms earlier and 30 ms later."""
+        box = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "z_m": 0.75}
+        world = truth({0: [
+            sighting(1000 * MS, x_m=50, y_m=8, vx_mps=-10, vy_mps=2, yaw_rad=3.0, **box),
+            sighting(1400 * MS, x_m=40, y_m=10, vx_mps=-12, vy_mps=1, yaw_rad=3.1, **box),
+        ]})  # fmt: skip
+        before, after = stated(world, [(960 * MS, 1000 * MS, 1000 * MS), (1430 * MS, 1400 * MS, 1400 * MS)])
+        assert before[0] == pytest.approx(box | {"x_m": 50.4, "y_m": 7.92, "vx_mps": -10, "vy_mps": 2, "yaw_rad": 3.0})
+        assert after[0] == pytest.approx(box | {"x_m": 39.64, "y_m": 10.03, "vx_mps": -12, "vy_mps": 1, "yaw_rad": 3.1})
+
+    @pytest.mark.parametrize(
+        ("told_ms", "captured_ms", "x_m"),
+        [(500, 1000, 5.0), (499, 1000, None), (960, 990, None), (960, 1100, 9.6), (1200, 990, 12.0),
+         (2500, 2000, 25.0), (2501, 2000, None), (2030, 2010, None)],
+    )  # fmt: skip
+    def test_up_to_the_longest_gap_and_only_who_was_there_at_the_capture(
+        self, told_ms: int, captured_ms: int, x_m: float | None
+    ) -> None:
+        """From 1 s to 2 s an object drives at 10 m/s, 10 m to the east of the origin at 1 s."""
+        world = truth({0: [sighting(k * 100 * MS, x_m=k, vx_mps=10) for k in range(10, 21)]})
+        [found] = stated(world, [(told_ms * MS, captured_ms * MS, captured_ms * MS)])
+        assert [state["x_m"] for state in found.values()] == ([] if x_m is None else [pytest.approx(x_m)])
+
+    def test_in_a_gap_the_nearer_end_counts(self) -> None:
+        """Away from 1 s to 1.6 s: until half of it moved on, then moved back; lists of both ends state each instant."""
+        world = truth({0: [sighting(1000 * MS, x_m=0, vx_mps=1), sighting(1600 * MS, x_m=50, vx_mps=2)]})
+        found = stated(world, [(at * MS, 1000 * MS, 1600 * MS) for at in (1250, 1300, 1350)])
+        assert [one[0]["x_m"] for one in found] == pytest.approx([0.25, 0.3, 49.5])
+
+
+@settings(deadline=None)
+@given(objects(), st.data())
+def test_stated_instants_against_the_oracle(seen: dict[int, list[Sighting]], data: st.DataObject) -> None:
+    frames = sorted({s.at_ns for each in seen.values() for s in each} | {0})
+    near = st.builds(lambda t, off: t + off, st.sampled_from(frames), st.integers(-3_000, 3_000))
+    instant = st.integers(-600 * MS, frames[-1] + 600 * MS) | near
+    told = sorted({
+        at_ns: (at_ns, *sorted(data.draw(st.tuples(instant, instant))))
+        for at_ns in data.draw(st.lists(instant, min_size=1, max_size=12))
+    }.values())  # fmt: skip
+    for (at_ns, earliest, latest), held in zip(told, stated(truth(seen, frames_ns=[0]), told), strict=True):
+        expected = {}
+        for object_ix, each in seen.items():
+            if (state := plain(each, at_ns)) is not None:
+                expected[object_ix] = state
+                continue
+            there = [s for s in each if abs(at_ns - s.at_ns) <= 500 * MS]
+            there = [
+                s for s in there if (latest >= s.at_ns - 1_000 if s.at_ns > at_ns else earliest <= s.at_ns + 1_000)
+            ]
+            if there:
+                nearest = min(there, key=lambda s: (abs(at_ns - s.at_ns), s.at_ns))
+                state = dict(zip(VALUES, nearest.values, strict=True))
+                for way, speed in (("x_m", "vx_mps"), ("y_m", "vy_mps")):
+                    state[way] += state[speed] * (at_ns - nearest.at_ns) * 1e-9
+                expected[object_ix] = state
+        assert held.keys() == expected.keys()
+        for object_ix, state in expected.items():
+            same(held[object_ix], state)
+
+
+@settings(deadline=None)
+@given(objects(), st.lists(st.integers(-600 * MS, 9_000 * MS), max_size=12))
+def test_where_no_clock_is_off_nothing_is_another_bit(seen: dict[int, list[Sighting]], at_ns: list[int]) -> None:
+    world, stamps = truth(seen, frames_ns=[0]), T0_NS + np.array(sorted(at_ns), dtype=np.int64)
+    asked: dict[str, Any] = {"t0_ns": T0_NS, "max_gap_s": MAX_GAP_S}
+    one, other = at_instants(world, stamps, **asked), at_stated_instants(world, stamps, (stamps, stamps), **asked)
+    for name in ("start", "object_ix", "frame_ix", "stamp_ns", *VALUES):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name

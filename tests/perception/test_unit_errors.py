@@ -165,6 +165,70 @@ class TestClock:
         for column in ("detection_s", "captured_s", "age_of_information_s"):
             assert clocks.table[column].item() == pytest.approx(exact.table[column].item(), abs=1e-9), column
 
+    SIGMA_S = 0.05
+
+    @staticmethod
+    def early_and_late() -> Recording:
+        """Cars and people, to 15 m/s: five from the first frame on, five who appear later, some leave."""
+        things = [EGO]
+        for k in range(5):
+            things += [
+                Thing(f"first {k}", "car", driving(-40 + 30 * k, 10 + 9 * k, 3 * k + 3, -2.0)),
+                Thing(
+                    f"later {k}", "pedestrian", driving(-40 + 30 * k, -10 - 9 * k, -1.5, 15 - 3 * k),
+                    there=lambda t, k=k: 0.35 + 0.3 * k < t < 2.55 + 0.1 * k,  # type: ignore[misc]
+                ),
+            ]  # fmt: skip
+        return scenes.recording(things, until_s=4.0)
+
+    def compared(self, fusion: str, **changes: Any) -> tuple[Any, Any]:
+        """The rows of an exact clock, and of one that is off, in 60 runs."""
+        of: dict[str, Any] = {
+            "runs": 60, "measure": {"onset": {"kind": "appears"}},
+            "configurations": {"late": {"units": ["mast"], "latency_s": 0.2, "fusion": {"kind": fusion}}},
+        } | changes  # fmt: skip
+        exact = run(experiment(units={"mast": unit()}, **of), [self.early_and_late()])
+        off = run(
+            experiment(units={"mast": unit(clock={"offset_sigma_s": self.SIGMA_S})}, **of), [self.early_and_late()]
+        )
+        return exact, off
+
+    @pytest.mark.parametrize("fusion", ["union", "gnn"])
+    def test_a_clock_error_costs_no_time_that_is_not_there(self, fusion: str) -> None:
+        """The unit sees all: who is there is listed, whatever the clock says, and known when the list arrives."""
+        exact, off = self.compared(fusion)
+        keys = ["object_id", "run"]
+        both = exact.table.merge(off.table, on=keys, suffixes=("", "_off"))
+        assert len(both) == 60 * 10
+        late_s = both["detection_s_off"] - both["detection_s"]
+        assert not late_s.isna().any()
+        first = both["object_id"].str.startswith("first")
+        # 1 µs: what is one instant. An entry about nobody would cost the next list, 0.1 s, in every other run.
+        assert abs(late_s[first].mean()) <= 1e-6
+        assert abs(late_s[~first].mean()) <= 1e-6
+
+    def test_what_a_fast_clock_tells_of_who_has_left_is_stale_and_not_false(self) -> None:
+        """Lists that are on their way when an object leaves tell of it, whatever the clock says."""
+        exact, off = self.compared(
+            "union", measure={"onset": {"kind": "appears"}, "objects": {"classes": ["pedestrian"]}}
+        )
+        for name in ("false_positives_per_min", "stale_false_positives_per_min"):
+            [rate], [rate_off] = exact.summary[name], off.summary[name]
+            assert rate > 0
+            assert rate_off == pytest.approx(rate, rel=1e-12), name
+
+    def test_an_offset_of_nothing_changes_no_bit(self) -> None:
+        of: dict[str, Any] = {
+            "runs": 3, "measure": {"onset": {"kind": "appears"}},
+            "configurations": {"late": {"units": ["mast"], "latency_s": 0.2, "fusion": {"kind": "gnn"}}},
+        }  # fmt: skip
+        without, nothing = (
+            run(experiment(units={"mast": unit(**clock)}, **of), [self.early_and_late()])
+            for clock in ({}, {"clock": {"offset_sigma_s": 0.0}})
+        )
+        assert without.table.equals(nothing.table)
+        assert without.summary.equals(nothing.summary)
+
     def test_ideal_fusion_does_not_know_of_it_and_is_said_not_to(self) -> None:
         plan = experiment(
             units={"mast": unit(clock={"offset_sigma_s": 0.05})}, configurations={"PEM": {"units": "all"}}
