@@ -14,7 +14,7 @@
 | `lists/<place>_<configuration>/<unit>` | lists that were lost, late or overtaken, of a unit that sends by a link |
 | `plots/visible_share/<object>/…` | how much of it is seen by the ego's units, and by the best of all |
 | `plots/visible_share/<object>/mark_1`, … | onset and detections on these curves |
-| `plots/position_error/<object>/<configuration>` | fused to true position: running median, and band |
+| `plots/position_error/<object>/<configuration>` | fused to true position: running quartiles |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | over all measured objects: GOSPA, how many are known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/differences.py`) |
 | `legend/…` | the colour of each configuration |

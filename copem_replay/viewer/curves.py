@@ -19,12 +19,14 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.scoring import settings_of
 from copem_replay.pipeline.visibility_curves import BY_ANY, BY_EGO, Curve
 from copem_replay.viewer.palette import EGO
-from copem_replay.viewer.running import running
+from copem_replay.viewer.running import break_lines, running
 from copem_replay.viewer.sink import Out, by_frame, elapsed_ns, entity_names, ns, part_of, plain
 
 LISTS_AT_ONCE = 2_000
 """For so many lists the truth is interpolated at a time (chosen)."""
 
+NO_LIST = np.empty(0, dtype=np.int64), np.empty(0)
+"""Where no time chunk comes before."""
 _LOOKS = {BY_EGO: (EGO, 2.0), BY_ANY: (TRUTH, 1.0)}
 
 
@@ -33,10 +35,12 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
     import rerun as rr
 
     for units, curve in curves.items():
-        known = ~np.isnan(curve.share)
-        # An empty row breaks the line. NaN would, too, but no two recordings with NaN compare equal.
-        kept = known | np.append(False, known[:-1])
-        value, instants = np.where(known, curve.share, -1.0)[kept], curve.elapsed_ns[kept]
+        line = break_lines(curve.elapsed_ns, curve.share[:, None])
+        share = np.full(len(line.counts), np.nan)
+        share[line.counts > 0] = line.values
+        known = ~np.isnan(share)
+        kept = known | np.append(False, known[:-1])  # the first row without a value is an empty one
+        value, instants = np.where(known, share, -1.0)[kept], line.elapsed_ns[kept]
         # Between two that are the same the line is the same without what is there.
         bends = np.append(True, value[1:] != value[:-1]) | np.append(value[:-1] != value[1:], True)[: len(value)]
         bends = bends[: len(value)]
@@ -51,10 +55,11 @@ def visible_share(out: Out, name: str, curves: Mapping[str, Curve]) -> None:
 def position_errors(
     out: Out, replay: Replay, experiment: Experiment, name: str, fused: Tracks, shown: Sequence[int], colour: Rgb
 ) -> None:
-    """Distance from fused to true position of the shown objects: running median, and its band."""
+    """Distance from fused to true position of the shown objects: running quartiles."""
     for k in shown:
         elapsed, error_m = position_error(replay, experiment, k, fused)
-        banded(out, ["plots", "position_error", entity_names(replay.scene)[k], part_of(name)], elapsed, error_m, colour)
+        path = ["plots", "position_error", entity_names(replay.scene)[k], part_of(name)]
+        draw_quartiles(out, path, elapsed, error_m, colour)
 
 
 def position_error(replay: Replay, experiment: Experiment, object_ix: int, fused: Tracks) -> tuple[Int, Float]:
@@ -70,15 +75,16 @@ def position_error(replay: Replay, experiment: Experiment, object_ix: int, fused
     return times, error_m[first]
 
 
-def banded(out: Out, path: list[str], elapsed_ns: Int, values: Float, colour: Rgb) -> None:
-    """A running median with its band; nothing where there is nothing."""
+def draw_quartiles(out: Out, path: list[str], elapsed_ns: Int, values: Float, colour: Rgb) -> None:
+    """A running median between the quartiles, thinner; nothing where there is nothing."""
     import rerun as rr
 
     of = running(elapsed_ns, values)
     if len(of.elapsed_ns):
-        columns = rr.Measurements.columns(values=of.median, variances=of.half**2)
-        out.columns(path, of.elapsed_ns, columns)
-        out.static(path, rr.Measurements.from_fields(colors=[colour], widths=[1.5], names=[path[-1]]))
+        lines = break_lines(of.elapsed_ns, of.quartiles)
+        out.columns(path, lines.elapsed_ns, rr.Scalars.columns(scalars=lines.values).partition(lines.counts))
+        names = [f"{path[-1]}, {said}" for said in ("25 %", "median", "75 %")]
+        out.static(path, rr.SeriesLines(names=names, colors=[colour] * 3, widths=[0.5, 1.5, 0.5]))
 
 
 def known(
@@ -144,12 +150,19 @@ def _annotated(replay: Replay, fused: Tracks, settings: Settings) -> Bool:
     )
 
 
-def gospas(out: Out, replay: Replay, experiment: Experiment, name: str, fused_tracks: FusedTracks, colour: Rgb) -> None:
-    """The curve of one configuration."""
+def gospas(
+    out: Out, replay: Replay, experiment: Experiment, name: str, fused_tracks: FusedTracks, colour: Rgb,
+    before: tuple[Int, Float],
+) -> tuple[Int, Float]:  # fmt: skip
+    """The curve of one configuration in a time chunk. `before`: what this gave of the chunk before, the last list."""
     import rerun as rr
 
-    elapsed, value_m = gospa_of(replay, experiment, fused_tracks)
-    path = ["plots", "gospa", part_of(name)]
-    out.columns(path, elapsed, rr.Scalars.columns(scalars=value_m))
+    found = gospa_of(replay, experiment, fused_tracks)
+    elapsed, value_m = (np.concatenate(pair) for pair in zip(before, found, strict=True))
+    path, drawn = ["plots", "gospa", part_of(name)], len(before[0])
+    lines = break_lines(elapsed, value_m[:, None], steps=True)
+    columns = rr.Scalars.columns(scalars=lines.values[drawn:]).partition(lines.counts[drawn:])
+    out.columns(path, lines.elapsed_ns[drawn:], columns)
     until_next = rr.components.InterpolationMode.StepAfter
     out.static(path, rr.SeriesLines(names=name, colors=colour, widths=1.5, interpolation_mode=until_next))
+    return elapsed[-1:], value_m[-1:]

@@ -23,7 +23,7 @@ from copem_replay.core.interpolation import states_at
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Int, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.curves import banded, position_error
+from copem_replay.viewer.curves import draw_quartiles, position_error
 from copem_replay.viewer.palette import DIFFERENCE
 from copem_replay.viewer.sink import Out, entity_names, f32, ns, part_of, table_rows
 
@@ -100,7 +100,7 @@ def _errors(
         both[both] = other_ns[near[both]] <= mine_ns[both] + SAME_INSTANT_NS
         more_m = mine_m[both] - other_m[near[both]]
         path = ["plots", "error_difference", entity_names(replay.scene)[k], part_of(name)]
-        banded(out, path, mine_ns[both], more_m, colour)
+        draw_quartiles(out, path, mine_ns[both], more_m, colour)
 
 
 def _ways(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -15,7 +15,7 @@ import pandas as pd
 
 from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import TRUTH
+from copem_replay.core.tracks import TRUTH, Float, Int
 from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.prepare import Replay
@@ -117,11 +117,15 @@ def write_rrd(
 
 @dataclass(frozen=True)
 class _File:
-    """One of the files: where it goes, what it shows, and the colours of its configurations, in order."""
+    """One of the files: where it goes, what it shows, and the colours of its configurations, in order.
+
+    `last_gospa`: by configuration the last point of its curve in the time chunks so far.
+    """
 
     out: Out
     content: Content
     colours: dict[str, Rgb]
+    last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
 
 
 def _measured(replay: Replay, experiment: Experiment, table: pd.DataFrame) -> list[int]:
@@ -207,7 +211,8 @@ def _fused(file: _File, run_tracks: Mapping[str, FusedTracks]) -> None:
     for name, colour in file.colours.items():
         boxes.fused_boxes(out, ["world", part_of(name)], of.replay.scene, run_tracks[name], colour)
         if len(of.replay.episodes.object_ix):
-            curves.gospas(out, of.replay, of.experiment, name, run_tracks[name], colour)
+            before = file.last_gospa.get(name, curves.NO_LIST)
+            file.last_gospa[name] = curves.gospas(out, of.replay, of.experiment, name, run_tracks[name], colour, before)
             since_ns = clock_of(of.replay.scene, of.table, name).known_ns
             curves.known(out, of.replay, name, run_tracks[name].fused, colour, since_ns)
 

@@ -11,7 +11,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,11 @@ import pytest
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.errors import OutputError
 from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.time_chunk import TimeChunk
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.blocks import replay_block
-from copem_replay.pipeline.one_run import tracks_of_run
+from copem_replay.pipeline.one_run import RunTracks, tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.selection import telling
@@ -261,21 +263,113 @@ def test_errors_are_those_of_the_instant_a_list_is_available(made: Made) -> None
     def error(name: str) -> list[dict[str, Any]]:
         return rows(made.path, f"/plots/position_error/7_car/{name}".replace(" ", "\\ "))
 
-    # Medians of a second around every quarter of one; ten lists a second.
+    # Quartiles of a second around every quarter of one; ten lists a second.
     exact = error("GT")
-    assert [row["Measurements:values"] for row in exact] == [[0.0]] * 17
+    assert [row["Scalars:scalars"] for row in exact] == [[0.0, 0.0, 0.0]] * 17
     assert [row[ELAPSED] for row in exact] == [250_000_000 * k for k in range(17)]
     late = error("GT late")  # ten metres a second, half a second
-    assert [row["Measurements:values"][0] for row in late] == pytest.approx([5.0] * 15)
-    assert [row["Measurements:variances"][0] for row in late] == pytest.approx([0.0] * 15, abs=1e-9)
+    assert np.array([row["Scalars:scalars"] for row in late]) == pytest.approx(np.full((15, 3), 5.0))
     assert (late[0][ELAPSED], late[-1][ELAPSED]) == (500_000_000, 4_000_000_000)  # at 4.5 s it has left
     once = error("PEM")
     assert [row[ELAPSED] for row in once] == [4_000_000_000]
     fused = made.run_tracks["PEM"].fused
     [seen] = np.flatnonzero((fused.row_object_ix == 1) & fused.valid[0])
     x, y = fused.x_m[0, seen], fused.y_m[0, seen]
-    assert once[0]["Measurements:values"] == [np.hypot(x - 60, y)]
+    assert once[0]["Scalars:scalars"] == [np.hypot(x - 60, y)] * 3
     assert not error("none")
+
+
+SLOW = {"at": [0, 1], "height_m": 6.0, "ground_z_m": 0.0, "pem": "noisy", "rate_hz": 0.5}
+NOISY = [SEES_ALL[0] | {"error": {"kind": "gaussian", "covariance_m2": [[1.0, 0.0], [0.0, 0.01]]}}]
+
+
+@pytest.fixture(scope="module")
+def with_gaps(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A pedestrian who is away from 3 s to 5 s and from 8 s to 8.7 s, as a noisy ego lists him, and a slow pole."""
+    scene = recording(
+        [
+            Thing("ego", "car", standing(0, 0)),
+            Thing("9", "pedestrian", standing(20, 0), there=lambda t: not (3.01 < t < 4.99 or 8.01 < t < 8.69)),
+        ],
+        until_s=12.0,
+    )
+    return make(
+        tmp_path_factory.mktemp("gaps") / "x.rrd", scene, pems={"noisy": NOISY},
+        units={"ego": EGO_UNIT | {"pem": "noisy"}, "pole": SLOW},
+        configurations={"PEM": {"units": ["ego"]}, "slow": {"units": ["pole"]}},
+        measure={"onset": {"kind": "appears"}, "objects": {"classes": ["pedestrian"]}},
+    )  # fmt: skip
+
+
+def drawn_lines(found: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """The rows of each line that the viewer draws: it breaks lines at empty rows."""
+    lines: list[list[dict[str, Any]]] = [[]]
+    for row in found:
+        if row["Scalars:scalars"]:
+            lines[-1].append(row)
+        else:
+            lines.append([])
+    return [line for line in lines if line]
+
+
+def test_lines_of_errors_are_quartiles_and_break_where_there_is_none(with_gaps: Made) -> None:
+    found = rows(with_gaps.path, "/plots/position_error/9_pedestrian/PEM")
+    lines = drawn_lines(found)
+    assert len(lines) == 3 - 1, "0.7 s without him are bridged by medians over a second"
+    for line in lines:
+        assert np.diff([row[ELAPSED] for row in line]).max() <= 500_000_000
+    # The errors as they are in the lists, and their quartiles as NumPy has them.
+    fused = with_gaps.run_tracks["PEM"].fused
+    mine = np.flatnonzero((fused.row_object_ix == 1) & fused.valid[0])
+    time_s = fused.common_arrives_s[fused.frame_ix[mine]]
+    error_m = np.hypot(fused.x_m[0, mine] - 20, fused.y_m[0, mine])
+    below = 0
+    for row in (row for line in lines for row in line):
+        near_m = error_m[np.abs(time_s - row[ELAPSED] / 1e9) <= 0.5 + 1e-6]
+        assert row["Scalars:scalars"] == pytest.approx(np.percentile(near_m, [25, 50, 75]))
+        assert min(row["Scalars:scalars"]) >= 0
+        low, median, high = row["Scalars:scalars"]
+        below += median - (high - low) / 2 < low
+    assert below, "a band of half their distance about the median would be lower"
+    assert static(with_gaps.path, "/plots/position_error/9_pedestrian/PEM")["SeriesLines:widths"] == [0.5, 1.5, 0.5]
+
+
+def test_a_line_of_a_slow_unit_breaks_after_each_list(with_gaps: Made) -> None:
+    """A list every two seconds: its GOSPA is drawn for half a second, as steps."""
+    found = rows(with_gaps.path, "/plots/gospa/slow")
+    lines = drawn_lines(found)
+    assert [line[0][ELAPSED] for line in lines] == [2_000_000_000 * k for k in range(7)]
+    for line in lines[:-1]:
+        assert [row[ELAPSED] - line[0][ELAPSED] for row in line] == [0, 499_999_999]
+        assert line[1]["Scalars:scalars"] == line[0]["Scalars:scalars"]
+    assert len(lines[-1]) == 1
+    gospa = drawn_lines(rows(with_gaps.path, "/plots/gospa/PEM"))
+    assert [len(line) for line in gospa] == [121], "ten lists a second"
+
+
+def test_lines_that_break_are_the_same_in_time_chunks(with_gaps: Made, tmp_path: Path) -> None:
+    replay, given = with_gaps.replay, with_gaps.given
+    cuts = [-np.inf, 1.0, 2.2, 2.3, 7.0, np.inf]
+    pieces = replace(replay, chunks=tuple(TimeChunk(*pair) for pair in pairwise(cuts)))
+    path = tmp_path / "pieces.rrd"
+    write_rrd(path, pieces, given, RunTracks(pieces, given, 3), with_gaps.table, SUMMARY, 3)
+    for name in ("/plots/gospa/slow", "/plots/gospa/PEM", "/plots/position_error/9_pedestrian/slow"):
+        assert rows(path, name) == rows(with_gaps.path, name), name
+
+
+def test_visible_shares_break_where_there_are_no_lists(tmp_path: Path) -> None:
+    """The log has no frame between 2 s and 3 s: of the best of all the line ends there; a slow unit's has breaks."""
+    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(20, 0))], until_s=4.0)
+    kept = (scene.truth.captured_s < 2.01) | (scene.truth.captured_s > 2.99)
+    frames = np.flatnonzero(kept)
+    truth = scene.truth.take_rows(np.flatnonzero(kept[scene.truth.frame_ix]))
+    truth = replace(
+        truth, frame_ix=np.searchsorted(frames, truth.frame_ix), stamp_ns=truth.stamp_ns[kept],
+        captured_s=truth.captured_s[kept], frame_unit_ix=truth.frame_unit_ix[kept], arrives_s=truth.arrives_s[:, kept],
+    )  # fmt: skip
+    made = make(tmp_path / "x.rrd", replace(scene, truth=truth), units={"ego": EGO_UNIT})
+    lines = drawn_lines(rows(made.path, "/plots/visible_share/9_pedestrian/ego"))
+    assert [[row[ELAPSED] / 1e9 for row in line] for line in lines] == [[0, 2], [3, 4]]
 
 
 def test_visible_shares_of_the_ego_and_of_the_best(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.viewer import palette, write_rrd
 from copem_replay.viewer.lanes import STEADY_S, steady
-from copem_replay.viewer.running import running
+from copem_replay.viewer.running import break_lines, running
 from copem_replay.viewer.statuses import KNOWN, STATUSES
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_rrd import SUMMARY, Made
@@ -232,15 +232,31 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
 # ------------------------------------------------------------------------------- errors
 
 
-def test_a_running_median_against_a_plain_one() -> None:
+def test_running_quartiles_against_plain_ones() -> None:
     chance = np.random.default_rng(3)
     elapsed = np.sort(chance.choice(100, 60, replace=False)) * 50_000_000
     values = chance.normal(size=60)
     of = running(elapsed, values)
     assert len(of.elapsed_ns)
-    for now, median, half in zip(of.elapsed_ns.tolist(), of.median, of.half, strict=True):
+    for now, quartiles in zip(of.elapsed_ns.tolist(), of.quartiles, strict=True):
         assert now % 250_000_000 == 0
-        near = sorted(v for t, v in zip(elapsed.tolist(), values, strict=True) if abs(t - now) <= 500_000_000)
-        assert median == pytest.approx(np.median(near))
-        low, high = near[round(0.25 * (len(near) - 1))], near[round(0.75 * (len(near) - 1))]
-        assert half == pytest.approx((high - low) / 2)
+        near = [v for t, v in zip(elapsed.tolist(), values, strict=True) if abs(t - now) <= 500_000_000]
+        assert quartiles == pytest.approx(np.quantile(near, [0.25, 0.5, 0.75]))
+
+
+@given(st.lists(st.integers(1, 1_500_000_000), max_size=20), st.booleans())
+def test_lines_break_exactly_where_rows_are_far_apart(steps_ns: list[int], steps: bool) -> None:
+    elapsed = np.cumsum([0, *steps_ns])
+    values = np.arange(2.0 * len(elapsed)).reshape(-1, 2)
+    lines = break_lines(elapsed, values, steps=steps)
+    said, found = iter(lines.values), []
+    for now, count in zip(lines.elapsed_ns.tolist(), lines.counts.tolist(), strict=True):
+        found.append((now, [next(said) for _ in range(count)]))
+    expected = []
+    for k, (now, row) in enumerate(zip(elapsed.tolist(), values.tolist(), strict=True)):
+        expected.append((now, row))
+        if k + 1 < len(elapsed) and elapsed[k + 1] - now > 500_000_000:
+            expected += [(now + 499_999_999, row)] if steps else []
+            expected.append((now + 500_000_000, []))
+    assert found == expected
+    assert next(said, None) is None
