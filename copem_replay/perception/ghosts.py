@@ -36,6 +36,8 @@ SIZES_M = {
 }  # fmt: skip
 """Length, width and height of what is listed, by class (chosen)."""
 assert tuple(SIZES_M) == CLASSES
+_NUMBER_BITS = np.uint64(52)
+"""In a ghost's word its number in the list begins here: below are 52 days of births, and no list has 4,096 ghosts."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +67,12 @@ class _Lists:
 
 @dataclass(frozen=True)
 class _Born:
-    """Ghosts of one sort: their words (B,) and when each is drawn; their rows (R,), ghost by ghost in order of time.
+    """Ghosts of one sort: their words (B,), one of each birth; their rows (R,), ghost by ghost in order of time.
 
     `list_ix`: of the unit's lists that are asked for. `host`: the row of the object beside which the ghost is, or −1.
     """
 
     words: Words
-    drawn_ns: Int
     ghost: Int
     list_ix: Int
     host: Int
@@ -144,8 +145,7 @@ def _born(
     host = hosts.row[alive.row_ix[ghost], list_ix] if hosts.row is not None else np.full(len(ghost), -1)
     there = host >= 0 if hosts.row is not None else np.ones(len(ghost), dtype=bool)
     words = hosts.words[alive.row_ix] + alive.address_ns.astype(np.uint64) + salt
-    drawn_ns = np.zeros(len(first), dtype=np.int64)
-    return _Born(words, drawn_ns, ghost[there], list_ix[there], host[there])
+    return _Born(words, ghost[there], list_ix[there], host[there])
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,10 @@ def _hosts(scene: Scene, found: Observations, lists: _Lists, sort: Ghosts) -> _H
 def _fresh(
     rng: CounterRng, hosts: _Hosts, lists: _Lists, numbered: tuple[int, Ghosts], runs: Int, salt: np.uint64
 ) -> _Born:
-    """Others in every list: how many by one number of each list (of each host in it), drawn at its capture."""
+    """Others in every list: how many by one number of each list (of each host in it), drawn at its capture.
+
+    A ghost's word has the capture, its instant of birth: ids, and draws that last, are its own.
+    """
     from scipy.stats import poisson
 
     n, sort = numbered
@@ -189,9 +192,10 @@ def _fresh(
     count = poisson.ppf(uniform, sort.in_list).astype(np.int64)
     which = np.repeat(np.arange(len(count)), count)
     number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-    words = hosts.words[host_ix[which]] + number.astype(np.uint64) + salt
+    born_ns = lists.stamp_ns[list_ix[which]].astype(np.uint64)
+    words = hosts.words[host_ix[which]] + born_ns + (number.astype(np.uint64) << _NUMBER_BITS) + salt
     host = hosts.row[host_ix[which], list_ix[which]] if hosts.row is not None else np.full(len(which), -1)
-    return _Born(words, lists.stamp_ns[list_ix[which]], np.arange(len(which)), list_ix[which], host)
+    return _Born(words, np.arange(len(which)), list_ix[which], host)
 
 
 def _states(
@@ -200,7 +204,7 @@ def _states(
     """Ghosts without any error, a track of each, and how they look from the unit: wholly visible."""
     n, sort = numbered
     none = np.zeros(len(born.words), dtype=np.int64)
-    random_key = RandomKey((lists.name,), none, born.words, born.drawn_ns)
+    random_key = RandomKey((lists.name,), none, born.words, none)
     place = np.stack([rng.uniform(f"ghosts {n} place {k}", random_key, runs)[0] for k in range(3)])
     turn_rad = 2 * np.pi * rng.uniform(f"ghosts {n} turn", random_key, runs)[0]
     shares = row_of(sort.classes)[None]

@@ -53,21 +53,10 @@ def claimed_rows(world: WorldChunk, runs: Int, ghosts: GhostRows | None) -> Clai
             np.concatenate([claims.track_id, of_ghosts.track_id]),
         )
         words = np.concatenate([words, ghosts.words])
-        same = np.concatenate([same, _of_ghosts(ghosts, experiment)])
+        same = words
     # With ids of its own a unit takes for one object what has one id.
     same = np.where(claims.track_id >= 0, claims.track_id.astype(np.uint64), same)
     return ClaimedRows(words, claims, same)
-
-
-def _of_ghosts(ghosts: GhostRows, experiment: ExpandedExperiment) -> Words:
-    """(R,) one number for each ghost: those that are others in every list are others to their unit, too."""
-    tracks = ghosts.found.tracks
-    lasts_s = np.ones(len(ghosts.words))
-    for unit_ix, unit in enumerate(experiment.modelled.values()):
-        for n, sort in enumerate(experiment.pems[str(unit.pem)].ghosts):
-            lasts_s[(tracks.row_unit_ix == unit_ix) & (ghosts.sort == n)] = sort.lasts_s
-    stamps = tracks.stamp_ns[tracks.frame_ix].astype(np.uint64)
-    return np.where(lasts_s > 0, ghosts.words, ghosts.words ^ _mixed(stamps))
 
 
 @dataclass(frozen=True)

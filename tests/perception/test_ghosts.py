@@ -15,6 +15,7 @@ from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import problems
 from copem_replay.io.recording import Recording
+from copem_replay.perception.claims import DrawnClaims, claims_of
 from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.perceive import with_states
 from copem_replay.pipeline.prepare import prepare
@@ -229,6 +230,54 @@ class TestWhatTheyLeave:
         fewer = run(plan.model_copy(update={"runs": 2}), [self.RECORDING])
         first = one.table[one.table["run"] < 2].reset_index(drop=True)
         pd.testing.assert_frame_equal(first, fewer.table.reset_index(drop=True), check_exact=True)
+
+
+class TestEachBirthIsAnother:
+    """Ghosts that are others in every list share nothing that lasts: no id, and no number of a memory."""
+
+    MAST: ClassVar = {"at": [0.0, 0.0], "height_m": 5.0, "pem": "eyes"}
+    PLAN = plan_of(
+        {"in_list": 5.0, "lasts_s": 0, "where": FIELD},
+        {"in_list": 1.0, "lasts_s": 0, "where": {"kind": "beside", "classes": ["truck"], "within_m": 3}},
+        units={"a": MAST, "b": MAST},
+        pem={
+            "couples": [SEES_60_M[0] | {"existence": {"kind": "scores", "real": [8, 2], "ghost": [2, 4]}}],
+            "tracks": {"lasts_s": 20.0}, "memory": {"existence": [{"share": 1.0, "correlation_s": "always"}]},
+        },
+    )  # fmt: skip
+    RECORDING = scene_of(Thing("t", "truck", driving(10, 0, 1)), Thing("u", "truck", standing(20, -9)), until_s=20.0)
+
+    @staticmethod
+    def claimed(rows: GhostRows, run_number: int) -> DrawnClaims:
+        replay = prepare(TestEachBirthIsAnother.RECORDING, TestEachBirthIsAnother.PLAN)
+        drawn = ghost_draws(replay.scene, rows, replay.expanded, run_number)
+        return claims_of(rows.found, replay.expanded, drawn, rows.sort)
+
+    def test_ids_and_scores(self) -> None:
+        made = found(self.PLAN, self.RECORDING, 3)
+        of_runs = [self.claimed(rows, k) for k, rows in enumerate(made)]
+        ids = np.concatenate([one.track_id for one in of_runs])
+        assert len(ids) > 3 * 2 * 201 * 6
+        assert (ids >= 0).all()
+        assert len(np.unique(ids)) == len(ids), "of all lists, hosts, sorts, units and runs"
+        for rows, one in zip(made, of_runs, strict=True):
+            # Of one run the words differ in each unit: two units draw by the same words, but not the same numbers.
+            for unit in (0, 1):
+                words = rows.words[rows.found.tracks.row_unit_ix == unit]
+                assert len(np.unique(words)) == len(words)
+            assert len(np.unique(one.existence)) > 0.99 * len(one.existence)
+            assert one.existence.mean() == pytest.approx(2 / 6, abs=0.02)
+
+    def test_they_are_the_same_in_a_part_of_the_log(self) -> None:
+        [whole, *_], replay = found(self.PLAN, self.RECORDING, 1), prepare(self.RECORDING, self.PLAN)
+        world = replay.world(self.PLAN)
+        part = ghosts_in(replay.scene, world.found, replay.expanded, replay.placed, 0, (3.05, 5.05))
+        assert part is not None
+        captured_s = whole.found.tracks.row_captured_s
+        there = np.flatnonzero((captured_s > 3.05) & (captured_s < 5.05))
+        assert part.words.tolist() == whole.words[there].tolist()
+        assert part.found.tracks.x_m[0].tolist() == whole.found.tracks.x_m[0, there].tolist()
+        assert self.claimed(part, 0).track_id.tolist() == self.claimed(whole, 0).track_id[there].tolist()
 
 
 def test_errors_of_the_couple_that_applies() -> None:
