@@ -150,7 +150,7 @@ def test_latency_counts_in_full_whatever_the_gate(latency_s: float) -> None:
     assert figure("existence_ece", of) == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize(("latency_s", "stale_per_min"), [(0.1, 0.0), (0.5, 60.0)])
+@pytest.mark.parametrize(("latency_s", "stale_per_min"), [(0.1, 0.0), (0.5, 75.0)])  # 5 in 4 s
 def test_what_a_stale_list_is_worth_now(latency_s: float, stale_per_min: float) -> None:
     of, none = late_by(latency_s), stale_per_min == 0
     assert (
@@ -311,7 +311,7 @@ def test_duplicates_of_measured_objects() -> None:
     of = assessed([both] * 4, places=places, episodes={CAR: (2, 3)})
     assert of.by_object[0, 0]["duplicates"] == 2  # in the lists looked at
     assert of.by_run[0]["duplicates"] == 4  # in all
-    assert figure("duplicates_per_min", of) == pytest.approx(60.0)
+    assert figure("duplicates_per_min", of) == pytest.approx(80.0)  # 4 in 3 s
     assert figure("false_positives_per_min", of) == 0.0
 
 
@@ -372,7 +372,7 @@ def test_ghosts_are_of_measured_classes_and_of_no_object_at_all() -> None:
     assert of.by_run[0]["ghosts"] == 4
     assert of.ghosts_at.tolist() == [[4, 4, 2, 2]]
     assert of.by_object["ghosts"].tolist() == [[3, 1]]  # at 0 s the other car is not yet looked at
-    assert figure("false_positives_per_min", of) == pytest.approx(80.0)  # 4 in 3 lists at 1 Hz
+    assert figure("false_positives_per_min", of) == pytest.approx(120.0)  # 4 in 3 lists at 1 Hz: 2 s
 
 
 def test_a_ghost_halfway_goes_to_the_first() -> None:
@@ -484,7 +484,7 @@ def test_no_episodes_no_lists() -> None:
     assert of.by_object.shape == (2, 0)
     assert of.error_m.shape == (2, 0)
     assert of.by_run["ghosts"].tolist() == [1, 0]
-    assert figure("false_positives_per_min", of) == pytest.approx(15.0)  # 1 in 2 runs of 2 lists at 1 Hz
+    assert figure("false_positives_per_min", of) == pytest.approx(30.0)  # 1 in 2 runs of 2 lists at 1 Hz: 1 s each
     assert all(figure(name, of) is None for name in ("gospa_m", "gospa_false_m", "ospa_m", "longest_gap_s"))
     of = assessed([], [], places={CAR: []}, episodes={CAR: (1, 3)})
     assert of.error_m.shape == of.gospa.shape == (2, 0)
@@ -492,9 +492,19 @@ def test_no_episodes_no_lists() -> None:
     assert all(figure(name, of) is None for name in FIGURES if name != "longest_gap_s")
 
 
+def test_a_log_of_ten_seconds_has_ten_seconds() -> None:
+    """101 lists at 10 Hz, from 0.0 to 10.0 s, five ghosts in all: 30 in a minute."""
+    lists = [entry(50) if k % 25 == 0 else NOTHING for k in range(101)]
+    of = assessed(lists, times_s=[k / 10 for k in range(101)], places={}, episodes={})
+    assert of.by_run[0]["time_s"] == pytest.approx(10.0)
+    assert figure("false_positives_per_min", of) == pytest.approx(30.0)
+    late = assessed(lists[5:], times_s=[k / 10 for k in range(5, 101)], places={}, episodes={})
+    assert late.by_run[0]["time_s"] == pytest.approx(9.5)  # lists that come half a second late
+
+
 def test_time_of_irregular_lists_and_of_one() -> None:
     of = assessed([entry(50)] * 4, times_s=[0, 1, 3, 4], ego=[(0, 0), (0, 0), None, (0, 0)], places={}, episodes={})
-    assert of.by_run[0]["time_s"] == pytest.approx(3.0)  # three lists, the only neighbours 1 s apart
+    assert of.by_run[0]["time_s"] == pytest.approx(1.0)  # three lists, the only neighbours 1 s apart
     assert figure("false_positives_per_min", assessed([entry(50)], places={}, episodes={})) is None
 
 

@@ -194,7 +194,7 @@ class TestMeasured:
         experiment = Experiment.model_validate(data | {"configurations": data["configurations"] | union})
         _, result = replayed(experiment)
         same_as_union(result, "stack")
-        assert figures(result)["false_positives_per_min"] == pytest.approx(3 / (3 * 0.3 / 60))
+        assert figures(result)["false_positives_per_min"] == pytest.approx(3 / (0.6 / 60))  # from 0.35 to 0.95 s
         assert result.accuracy is not None
 
     def test_nothing_is_drawn(self, tmp_path: Path) -> None:

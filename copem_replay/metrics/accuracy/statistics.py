@@ -101,7 +101,7 @@ OBJECT = np.dtype(
 RUN = np.dtype(
     [
         ("lists", "i8"),  # at which there is a place to measure from
-        ("time_s", "f8"),  # that many times the mean spacing of neighbours among them
+        ("time_s", "f8"),  # from the first of them to the last, but between neighbours only
         ("ospa_m", "f8"),
         ("ghosts", "i8"),
         ("stale_ghosts", "i8"),
