@@ -26,7 +26,8 @@ CorrelationTime = Annotated[
 class Part(Frozen):
     """A part of a quantity's draws that lasts.
 
-    `share`: of the variance where normals are drawn (errors), of the lists where uniforms are (detection).
+    `share`: of the variance where normals are drawn (errors), of the lists where uniforms are (detection, class,
+    existence).
     `correlation_s`: the time in which the correlation decays to 1/e. `of`: what shares the number: one unit and object
     (`pair`), all objects of a unit, all units of an object, or everything. `path`: the number is `held` and then
     replaced, or it `drifts`; by default uniforms are held and normals drift.

@@ -139,6 +139,15 @@ class TestScores:
         assert lag1 == pytest.approx(math.exp(-0.1), abs=0.03)
         assert stats.kstest(one.existence[::70], stats.beta(8, 2).cdf).pvalue > 1e-3
 
+    def test_a_share_of_its_memory_is_of_lists(self) -> None:
+        """Two thirds of the lists claim the one number that lasts for the run, the others each a number of its own."""
+        couples = [SEES_ALL[0] | {"existence": self.SCORES}]
+        memory = {"existence": [{"share": 2 / 3, "correlation_s": "always"}]}
+        [one], _ = claims(plan_of({"couples": couples, "memory": memory}), standing_child(300.0), 1)
+        counts = np.unique(one.existence, return_counts=True)[1]
+        assert counts.max() / 3001 == pytest.approx(2 / 3, abs=4 * math.sqrt(2 / 9 / 3001))
+        assert np.sort(counts)[-2] == 1
+
     @pytest.mark.parametrize("calibrated", [True, False])
     def test_calibrated_scores_mean_what_they_say(self, calibrated: bool) -> None:
         """One child in every list and half a ghost; the union passes on what its unit says."""
