@@ -2,7 +2,7 @@
 
 It issues one at every instant at which at least one list arrives (within 1 µs is one instant), from each unit's newest
 list that has arrived, none older than `max_age_s`, counted from capture, on top of the list's own way to the receiver.
-A list that arrives after a newer one of its unit is not used.
+Ideal fusion and trackers use every other list that arrives at the instant as well.
 """
 
 from __future__ import annotations
@@ -28,6 +28,15 @@ class FusionSchedule:
     newest: Int
     arrived: Int
     arrived_start: Int
+
+    def beside_newest(self) -> tuple[Int, Int]:
+        """Lists that arrive at an instant without being their unit's newest there: their instants and themselves, (B,).
+
+        They arrive together with a newer one of their unit, or after it. Each list arrives once.
+        """
+        instant = np.repeat(np.arange(len(self.issue_s)), np.diff(self.arrived_start))
+        beside = (self.newest[instant] != self.arrived[:, None]).all(axis=1)
+        return instant[beside], self.arrived[beside]
 
     def between(self, from_s: float, until_s: float) -> FusionSchedule:
         """Those from one time on and before another."""
@@ -72,7 +81,7 @@ def _ends_instant(ordered_s: Float) -> Bool:
 
 
 def out_of_sequence(heard: Tracks) -> Bool:
-    """(F,) lists that arrive when a newer one of their unit is there already, or not at all."""
+    """(F,) lists that arrive together with a newer one of their unit, or after it, or not at all."""
     arrives_s, unit = heard.common_arrives_s, heard.frame_unit_ix
     result: Bool = ~np.isfinite(arrives_s)
     came = np.flatnonzero(~result)
@@ -81,4 +90,23 @@ def out_of_sequence(heard: Tracks) -> Bool:
     age = unit[came] * len(came) + np.unique(heard.stamp_ns[came], return_inverse=True)[1]
     newest = np.maximum.accumulate(age)
     result[came[1:][age[1:] <= newest[:-1]]] = True
+    return result
+
+
+def overtaken(arriving: Tracks) -> Bool:
+    """(F,) lists that arrive later than a newer one of their unit: by more than a microsecond, else it is together."""
+    arrives_s = arriving.common_arrives_s
+    result: Bool = np.isfinite(arrives_s) & (arrives_s > newer_arrives_s(arriving) + _TOLERANCE_S)
+    return result
+
+
+def newer_arrives_s(arriving: Tracks) -> Float:
+    """(F,) when the first of the lists arrives that their unit captured later; inf: none does."""
+    arrives_s, unit = arriving.common_arrives_s, arriving.frame_unit_ix
+    result = np.full(len(arrives_s), np.inf)
+    order = np.lexsort((arriving.stamp_ns, unit))
+    for mine in np.split(order, np.flatnonzero(np.diff(unit[order])) + 1):
+        stamps = arriving.stamp_ns[mine]
+        first_s = np.append(np.minimum.accumulate(arrives_s[mine][::-1])[::-1], np.inf)
+        result[mine] = first_s[np.searchsorted(stamps, stamps, side="right")]
     return result

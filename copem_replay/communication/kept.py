@@ -19,13 +19,14 @@ class KeptEntries:
     """Of units whose messages are partial the entries that the receiver has of them, as lists (L,) beside those sent.
 
     List l has the entries `entry[start[l] : start[l + 1]]`, each as it was sent, in messages of the unit up to `frame`.
-    `newest (K, U)`: as in FusionSchedule, and F + l for list l; F: how many lists are sent.
+    `newest (K, U)`: as in FusionSchedule, and F + l for list l; F: how many lists are sent. `partial (U,)`: of whom.
     """
 
     start: Int
     entry: Int
     frame: Int
     newest: Int
+    partial: Bool
 
 
 class Sent(NamedTuple):
@@ -46,7 +47,8 @@ def kept_entries(
     frame = np.repeat(np.arange(len(heard.stamp_ns)), np.diff(sent.start))
     same = np.where(partial[heard.frame_unit_ix[frame]], sent.same, -1)
     lists = _Lists(sent.start, heard.frame_unit_ix, heard.captured_s, heard.common_arrives_s + max_age_s + _TOLERANCE_S)
-    return KeptEntries(*_kept(*_instants(schedule), before, at.newest, lists, frame, same, np.flatnonzero(partial)))
+    made = _kept(*_instants(schedule), before, at.newest, lists, frame, same, np.flatnonzero(partial))
+    return KeptEntries(*made, partial)
 
 
 class _Lists(NamedTuple):

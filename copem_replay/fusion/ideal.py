@@ -1,6 +1,8 @@
 """The Ideal Fusion Model (Piazzoni et al. 2022): matching by truth id, Σ = (Σₙ Σₙ⁻¹)⁻¹, μ = Σ · Σₙ Σₙ⁻¹ μₙ.
 
-It combines what the units said, stale or not: nothing is predicted. Assumes Gaussian errors, independent across units.
+It combines what the units said, stale or not: nothing is predicted. Of each unit and object it takes the newest entry
+among those of the unit's newest list and of all lists that the receiver takes in at the instant: each is information,
+and other fusions of the same lists must not know sooner. Assumes Gaussian errors, independent across units.
 Two ways with one law: the units' sampled errors are weighed (Σₙ Σ Σₙ⁻¹ εₙ), or ε ~ N(μ, Σ) is drawn once. What the
 paper leaves open is combined by inverse variance as well: yaw on the circle, size, speed; height above ground by mean.
 """
@@ -43,17 +45,19 @@ def fuse(
     `captured_s` the newest capture among the lists it goes by. NaN where an object is in none of them.
     """
     at = at or fusion_schedule(heard, max_age_s=max_age_s)
-    rows, start, object_ix, instant = _contributions(
-        heard, at.newest if kept is None else kept.newest, without_object_ix, kept
-    )
-    valid = _any(heard.valid, rows, start)
+    beside = beside_newest(heard, at, kept)
+    rows, start, object_ix, instant = _contributions(heard, at, beside, without_object_ix, kept)
+    counts, rows, start = _newest_of_unit(heard, rows, start) if len(beside.frame) else (heard.valid, rows, start)
+    valid = _any(counts, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     weighed = weighed or Weighed.of(heard)
     given = Positions(heard.x_m, heard.y_m, *weighed.covariances)
-    _combine_position(heard.valid, given, weighed.information, rows, start, Positions(*out.values()))
-    spread = _combine_scalars(heard, weighed, rows, start, out)
+    _combine_position(counts, given, weighed.information, rows, start, Positions(*out.values()))
+    spread = _combine_scalars(heard, counts, weighed, rows, start, out)
     captured = np.where(at.newest >= 0, heard.captured_s[at.newest], -np.inf).max(axis=1, initial=-np.inf)
     stamps = np.where(at.newest >= 0, heard.stamp_ns[at.newest], NO_CAPTURE_NS).max(axis=1)
+    np.maximum.at(captured, beside.instant, heard.captured_s[beside.frame])
+    np.maximum.at(stamps, beside.instant, heard.stamp_ns[beside.frame])
     first = np.flatnonzero(np.diff(object_ix, prepend=-1) != 0)
     fused = Tracks(
         units=("fused",),
@@ -101,8 +105,37 @@ def kept_by_object(
     return kept_entries(heard, Sent(bounds, np.where(known, of, -1)[order]), partial, schedule, at, max_age_s=max_age_s)
 
 
+class Beside(NamedTuple):
+    """Lists (B,) that ideal fusion goes by at an instant beside the newest ones, each once."""
+
+    instant: Int
+    frame: Int
+
+
+def beside_newest(heard: Tracks, at: FusionSchedule, kept: KeptEntries | None) -> Beside:
+    """Those of the instants `at`; what is kept of units whose messages are partial has theirs already."""
+    instant, frame = at.beside_newest()
+    if kept is not None:
+        whole = ~kept.partial[heard.frame_unit_ix[frame]]
+        instant, frame = instant[whole], frame[whole]
+    return Beside(instant, frame)
+
+
+def _lists(heard: Tracks, at: FusionSchedule, beside: Beside, kept: KeptEntries | None) -> tuple[Int, Int]:
+    """Instants, ascending, and the lists that each goes by: unit by unit, the newest first."""
+    newest = at.newest if kept is None else kept.newest
+    instant, unit = np.nonzero(newest >= 0)
+    frame = newest[newest >= 0]
+    if not len(beside.frame):
+        return instant, frame
+    age = np.append(np.full(len(frame), np.iinfo(np.int64).min), -heard.stamp_ns[beside.frame])
+    instant, frame = np.append(instant, beside.instant), np.append(frame, beside.frame)
+    order = np.lexsort((age, np.append(unit, heard.frame_unit_ix[beside.frame]), instant))
+    return instant[order], frame[order]
+
+
 def _contributions(
-    heard: Tracks, newest: Int, without_object_ix: int, kept: KeptEntries | None
+    heard: Tracks, at: FusionSchedule, beside: Beside, without_object_ix: int, kept: KeptEntries | None
 ) -> tuple[Int, Int, Int, Int]:
     """Which rows of `heard` make each fused row, grouped: rows (C,), start (P + 1,), object and instant (P,).
 
@@ -113,8 +146,7 @@ def _contributions(
     if kept is not None:
         begin, count = np.append(begin, kept.start[:-1] + len(order)), np.append(count, np.diff(kept.start))
         order = np.append(order, order[kept.entry])
-    instant, _unit = np.nonzero(newest >= 0)
-    frame = newest[newest >= 0]
+    instant, frame = _lists(heard, at, beside, kept)
     begin, count = begin[frame], count[frame]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     rows = order[np.repeat(begin, count) + within]
@@ -127,6 +159,33 @@ def _contributions(
     rows, instant, object_ix = rows[by], instant[by], object_ix[by]
     new = np.flatnonzero((np.diff(object_ix, prepend=-1) != 0) | (np.diff(instant, prepend=-1) != 0))
     return rows, np.append(new, len(rows)), object_ix[new], instant[new]
+
+
+def _newest_of_unit(heard: Tracks, rows: Int, start: Int) -> tuple[Bool, Int, Int]:
+    """Which rows count, (S, P): of a unit's entries of one object at an instant only the newest that there is.
+
+    And the contributions, as `_contributions` has them, without those that were detected and count in no run. A list
+    beside a newest one is at one instant only, so its rows count there or nowhere.
+    """
+    counts, unit_ix = heard.valid.copy(), heard.row_unit_ix
+    _take_older(heard.valid, rows, start, unit_ix, counts)
+    stay = counts[:, rows].any(axis=0) | ~heard.valid[:, rows].any(axis=0)
+    return counts, rows[stay], np.append(0, np.cumsum(stay))[start]
+
+
+@borrowing
+def _take_older(valid: Bool, rows: Int, start: Int, unit_ix: Int, counts: Bool) -> None:
+    # Contributions are in the order of units, and of each unit the newest is the first.
+    for s in range(valid.shape[0]):
+        for p in range(len(start) - 1):
+            unit, there = -1, False
+            for c in range(start[p], start[p + 1]):
+                r = rows[c]
+                if unit_ix[r] != unit:
+                    unit, there = unit_ix[r], False
+                if valid[s, r] and there:
+                    counts[s, r] = False
+                there = there or valid[s, r]
 
 
 def _information(heard: Tracks) -> tuple[Float, Float, Float]:
@@ -199,13 +258,18 @@ def _stated(heard: Tracks) -> list[Float | None]:
     return [getattr(heard, name) for name in _VARIANCES]
 
 
-def _combine_scalars(heard: Tracks, weighed: Weighed, rows: Int, start: Int, out: dict[str, Float]) -> dict[str, Float]:
-    """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances."""
-    shape = len(heard.valid), len(start) - 1
+def _combine_scalars(
+    heard: Tracks, counts: Bool, weighed: Weighed, rows: Int, start: Int, out: dict[str, Float]
+) -> dict[str, Float]:
+    """Put inverse-variance means (S, P) of scalars over the contributions into `out`; returns their variances.
+
+    `counts (S, P)`: which rows contribute.
+    """
+    shape = len(counts), len(start) - 1
     means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
     scratch = np.empty(len(rows), np.int64), np.empty((shape[1], len(_WEIGHED_BY)), np.bool_)
     which = np.array([*_WEIGHED_BY.values()])
-    _scalars(heard.valid, weighed.scalars, weighed.weights, which, rows, start, means, spreads, scratch)
+    _scalars(counts, weighed.scalars, weighed.weights, which, rows, start, means, spreads, scratch)
     found = dict(zip(_WEIGHED_BY, means, strict=True))
     out["yaw_rad"] = np.arctan2(found.pop("sin"), found.pop("cos"))
     out.update(found)

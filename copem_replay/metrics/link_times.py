@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from copem_replay.communication.arrivals import out_of_sequence
+from copem_replay.communication.arrivals import out_of_sequence, overtaken
 from copem_replay.core.tracks import Float, Tracks
 from copem_replay.metrics.metric import Given, Metric
 
@@ -44,7 +44,7 @@ class LinkTimes:
 def link_times(seen: Tracks, arriving: Tracks, heard: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
     """Of lists that some units send in one run, `seen` as they are sent, to a log's end.
 
-    `heard`: as the receiver takes them in; of those it takes in at once the older ones are not overtaken.
+    `arriving`: as they arrive, by which they are overtaken or not; `heard`: as the receiver takes them in.
     """
     arrives_s, late = heard.common_arrives_s, out_of_sequence(heard)
     made = np.isfinite(seen.common_arrives_s)
@@ -57,9 +57,7 @@ def link_times(seen: Tracks, arriving: Tracks, heard: Tracks, units: Collection[
         until_s = np.append(arrives_s[mine][1:], end_s)
         parts.append((arrives_s[mine] - heard.captured_s[mine], until_s - heard.captured_s[mine]))
     from_s, to_s = (np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in (0, 1))
-    return LinkTimes(
-        int(made.sum()), int((made & ~came).sum()), int((came & out_of_sequence(arriving)).sum()), from_s, to_s
-    )
+    return LinkTimes(int(made.sum()), int((made & ~came).sum()), int((came & overtaken(arriving)).sum()), from_s, to_s)
 
 
 def _times(given: Given) -> LinkTimes | None:
@@ -78,7 +76,7 @@ LINK = (
          help="age since capture of a unit's newest list that arrived by a link: at most this for 50 % of the time"),
     _row("age_of_information_p95_s", value=lambda of: of.age_s(0.95), help="the same for 95 % of the time"),
     _row("overtaken_share", value=lambda of: _share(of.overtaken, of.sent - of.lost),
-         help="share of the arriving lists that come after a newer one of their unit; trackers still use them, and "
-              "all fusions do where messages are partial"),
+         help="share of the arriving lists that come after a newer one of their unit; ideal fusion and trackers still "
+              "use them, and all fusions do where messages are partial"),
 )  # fmt: skip
 """Columns of `summary.csv` where a configuration has a link."""

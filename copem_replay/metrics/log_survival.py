@@ -72,17 +72,19 @@ def first_of(arrives_s: Float, listed: Float, unit_ix: Int, share: Float, lasts:
 def confirmed(instant: Int, arrives_s: Float, listed: Float, hits: int, of: int) -> FirstKnown:
     """When for the first time `hits` ≥ 2 of the last `of` captures hold the object; lists (P,) as in `first_of`.
 
-    `instant (P,)`: number of the capture instant of each list. What is captured together arrives together.
+    `instant (P,)`: number of the capture instant of each list. What is captured together arrives together, what is
+    captured later not sooner: several instants may arrive together, too.
     """
-    time_s, place = _by_instant(arrives_s)
-    number = np.unique(instant)
-    assert len(number) == len(time_s)
+    time_s, arrival = _by_instant(arrives_s)
+    number, place = np.unique(instant, return_inverse=True)
+    arrival_of = np.zeros(len(number), dtype=np.int64)
+    arrival_of[place] = arrival
     without = np.minimum(np.diff(number, prepend=number[:1]) - 1, of)
-    total = _at(place, listed, len(time_s))
-    probability, half = np.zeros(len(time_s)), np.zeros(len(time_s))
-    log_never, slope = _chain(_at(place, _log_missed(listed, 1.0), len(time_s)), total, without, hits, of, probability)
-    log_half, _ = _chain(_at(place, _log_missed(listed, _HALF), len(time_s)), total, without, hits, of, half)
-    return _known(time_s, probability, log_never, slope, log_half)
+    total = _at(place, listed, len(number))
+    probability, half = np.zeros(len(number)), np.zeros(len(number))
+    log_never, slope = _chain(_at(place, _log_missed(listed, 1.0), len(number)), total, without, hits, of, probability)
+    log_half, _ = _chain(_at(place, _log_missed(listed, _HALF), len(number)), total, without, hits, of, half)
+    return _known(time_s, _at(arrival_of, probability, len(time_s)), log_never, slope, log_half)
 
 
 def _known(time_s: Float, probability: Float, log_never: float, slope: float, log_half: float) -> FirstKnown:

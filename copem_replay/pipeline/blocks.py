@@ -314,7 +314,6 @@ def _by_truth_id(lists: _Lists, experiment: Experiment, sight_s: dict[str, Float
             confirm=experiment.measure.confirm,
             count_earlier=experiment.measure.count_earlier,
             max_age_s=configuration.max_age_s,
-            partial=lists.units.partial,
         )
         events[name] = Events(heard.units, result, sight_s[name])
     return events

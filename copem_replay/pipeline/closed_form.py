@@ -1,11 +1,12 @@
 """Exact detection times: their distribution in closed form, without a single draw.
 
-Lists are independent given the truth, and with ideal fusion an object is known when any list that has arrived holds it:
-P(T > t) = Π (1 − p) over all lists that have arrived by t. Where detection lasts, lists that go by one number are not
-independent, and a filter gives the factors (metrics/lasting_survival.py). Confirmation by k of n is a Markov chain over
-the last n − 1 capture instants where all units capture together and their lists arrive together; elsewhere it has no
-such form, and is refused. Both are worked out in metrics/log_survival.py. With the distribution of the reaction follow
-the probabilities to pass and to fail. docs/guide/metrics.md has the definitions.
+Lists are independent given the truth, and with ideal fusion an object is known when any list that has arrived holds
+it: P(T > t) = Π (1 − p) over all lists that have arrived by t. Where detection lasts, lists that go by one number are
+not independent, and a filter gives the factors (metrics/lasting_survival.py). Confirmation by k of n is a Markov
+chain over the last n − 1 capture instants where all units capture together and their lists arrive together, in the
+order of their captures; elsewhere it has no such form, and is refused. Both are worked out in
+metrics/log_survival.py. With the distribution of the reaction follow the probabilities to pass and to fail.
+docs/guide/metrics.md has the definitions.
 """
 
 from __future__ import annotations
@@ -162,14 +163,20 @@ def _shared_instants(replay: Replay, heard: Tracks, name: str) -> Int:
                 "every instant at which another does, and confirmation over such lists has no closed form; give all "
                 "units one rate_hz and phase_s, confirm with one hit, or leave `exact` out"
             )
+    latest_s = -np.inf
     for instant in of_all:
         arrivals = heard.common_arrives_s[came & (instants == instant)]
         if np.ptp(arrivals) > _TOLERANCE_S:
-            raise ExperimentError(
-                f"{replay.scene.log}: exact: configuration {name}: lists captured together arrive up to "
-                f"{np.ptp(arrivals):g} s apart, and confirmation over such lists has no closed form; give all units "
-                "one latency, confirm with one hit, or leave `exact` out"
-            )
+            how = f"lists captured together arrive up to {np.ptp(arrivals):g} s apart"
+        elif arrivals.min() < latest_s - _TOLERANCE_S:
+            how = f"lists arrive up to {latest_s - arrivals.min():g} s after lists captured later"
+        else:
+            latest_s = max(latest_s, arrivals.max())
+            continue
+        raise ExperimentError(
+            f"{replay.scene.log}: exact: configuration {name}: {how}, and confirmation over such lists has no closed "
+            "form; give all units one latency, confirm with one hit, or leave `exact` out"
+        )
     return instants
 
 

@@ -22,7 +22,7 @@ from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Scene, Tracks, joi
 from copem_replay.core.unit_faults import UnitFaults
 from copem_replay.experiment.schema import Configuration
 from copem_replay.fusion.base import Ideal, ListFusion, fused_by, resumed_by
-from copem_replay.fusion.ideal import draw_posterior, fuse, kept_by_object
+from copem_replay.fusion.ideal import beside_newest, draw_posterior, fuse, kept_by_object
 from copem_replay.fusion.inputs import Claims, RowEntries, inputs, listed_rows, with_kept
 from copem_replay.perception.ghosts import GhostRows, ghost_draws, ghosts_in
 from copem_replay.perception.observation import Observations
@@ -248,7 +248,8 @@ class Receivers:
             if partial.any():
                 of_partial = kept_by_object(heard, partial, schedule, at, max_age_s=max_age_s)
             known = b"" if of_partial is None else of_partial.entry.tobytes()
-            made_of = (of_truth, states, at.newest.tobytes(), known)
+            beside = b"".join(part.tobytes() for part in beside_newest(heard, at, of_partial))
+            made_of = (of_truth, states, at.newest.tobytes(), beside + known)
             if last is None or last[0] != made_of:
                 ego = world.scene.ego_ix
                 weighed = None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from copem_replay.communication.arrivals import out_of_sequence
+from copem_replay.communication.arrivals import overtaken
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_NS, Float, Int
@@ -24,7 +24,7 @@ from copem_replay.viewer.statuses import LOST as LIST_LOST
 FATES = ("in time", "lost", "late", "overtaken")
 IN_TIME, LOST, LATE, OVERTAKEN = range(len(FATES))
 COLOURS: dict[int, Rgb] = {LOST: STATUS[LIST_LOST], LATE: STATUS[CAPTURED], OVERTAKEN: STATUS[UNMATCHED]}
-"""Of lanes: what an object's lane says of a lost list, one under way, and one that serves nothing."""
+"""Of lanes: as in an object's lane a lost list, one under way, and one that no entry is matched with."""
 QUIET_S, TOLD_S = 1.0, 5.0
 """Lists no more than the first apart are told in one row, up to the second after its first one; whenever there is no
 other list between them (chosen: a burst is a row, and ten minutes of single losses are 120)."""
@@ -58,12 +58,12 @@ def linked_lists(fused_tracks: FusedTracks, place: int, name: str, max_age_s: fl
     """Of each unit of a configuration that sends by a link; `place`: the configuration's among those of the file.
 
     Late: longer on its way than `max_age_s`, or by more than an interval of the unit's lists longer than half of them.
-    Overtaken: it arrives when a newer list of the unit is there, so nothing goes by it.
+    Overtaken: it arrives later than a newer list of the unit; what comes in at one tick comes together.
     """
     heard, by_link = fused_tracks.heard, fused_tracks.by_link
     if by_link is None:
         return []
-    overtaken, found = out_of_sequence(heard), []
+    late_after_newer, found = overtaken(heard), []
     for k, entity in enumerate(distinct([plain(unit) for unit in heard.units])):
         mine = np.flatnonzero(by_link & (heard.frame_unit_ix == k))
         if not len(mine):
@@ -74,7 +74,7 @@ def linked_lists(fused_tracks: FusedTracks, place: int, name: str, max_age_s: fl
         interval_s = float(np.median(np.diff(captured_s))) if len(mine) > 1 else np.inf
         usual_s = float(np.median(way_s[came])) if came.any() else np.inf
         late = way_s > min(max_age_s, usual_s + interval_s) + _TOLERANCE_S
-        fate = np.select([~came, overtaken[mine], late], [LOST, OVERTAKEN, LATE], IN_TIME)
+        fate = np.select([~came, late_after_newer[mine], late], [LOST, OVERTAKEN, LATE], IN_TIME)
         path = ("lists", f"{place + 1}_{plain(name)}", entity)
         found.append(UnitLists(heard.units[k], path, captured_s, arrives_s, fate, interval_s))
     return found

@@ -154,7 +154,7 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 LINKS = """
 - lanes `lists/…` under those of an object: a unit that sends by a link; from the capture of a list to that of the next,
   if it was *lost*, *late* (longer on its way than `max_age_s`, or by an interval of its lists longer than usual) or
-  *overtaken* by a newer one, so that it served nothing; else it came in time"""
+  *overtaken* by a newer one, which fusions of the newest lists then go by alone; else it came in time"""
 
 
 def summary(

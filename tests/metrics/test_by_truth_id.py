@@ -306,6 +306,34 @@ class TestConfirmed:
                       hits=2, of=2)  # fmt: skip
         assert detected(world) == {(0, 0): Found(600, 200, "ego")}
 
+    def test_of_a_unit_alone_a_list_that_never_arrives_is_no_capture(self) -> None:
+        """The ego's list of 0.2 s is lost: those of 0.0, 0.1 and 0.3 s are three in a row, and two of them hold it.
+
+        With the mast, which lists nothing, they are four capture instants.
+        """
+        world = World({"ego": at_rate(100, "x..x.."), "mast": at_rate(100, "......")}, {0: (0, 900)}, hits=2, of=3)
+        heard = tracks(world)
+        lost = np.where((heard.captured_s == 0.2) & (heard.frame_unit_ix == 0), np.inf, heard.arrives_s)
+        assert detected(world, replace(heard, arrives_s=lost)) == {(0, 0): Found(300, 300, "ego")}
+        assert detected(world) == {(0, 0): NEVER}
+
+    def test_every_list_counts_when_it_is_taken_in(self) -> None:
+        """Lists of 0.1 to 0.5 s come in at 0.5 s, and the newest does not hold it; that of 0.6 s is overtaken."""
+        world = World({"ego": at_rate(100, "..x...x.")}, {0: (50, 900), 1: (250, 900)})
+        heard = tracks(world)
+        late_s = np.array([[0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.9, 0.7]])
+        assert detected(world, replace(heard, arrives_s=late_s)) == {(0, 0): Found(500, 200, "ego"), (0, 1): NEVER}
+        after = replace(world, episodes={0: (250, 900)})
+        assert detected(after, replace(heard, arrives_s=late_s)) == {(0, 0): Found(900, 600, "ego")}
+
+    @pytest.mark.parametrize(("held", "captured"), [("..x.x...", 400), ("..xx....", 300)])
+    def test_what_confirms_at_one_instant_contributes_though_a_newer_list_came_with_it(
+        self, held: str, captured: int
+    ) -> None:
+        world = World({"ego": at_rate(100, held)}, {0: (0, 900)}, hits=2, of=3)
+        at_once_s = np.array([[0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.9, 0.9]])
+        assert detected(world, replace(tracks(world), arrives_s=at_once_s)) == {(0, 0): Found(500, captured, "ego")}
+
     def test_a_list_exactly_at_its_greatest_age_still_contributes(self) -> None:
         """The ego's only list, of 0.5 s, is 0.4 s old when the mast's of 0.4 s arrives at 0.9 s: not too old."""
         ego = Unit(0, ((500, holds(0)),))

@@ -111,6 +111,14 @@ def test_lost_late_and_overtaken(made: Made, tmp_path: Path) -> None:
     assert {entity for entity in entities(path) if "lists" in entity} == {"/lists/2_air/pole", "/events/air/lists"}
 
 
+def test_lists_that_arrive_together_are_not_overtaken(made: Made, tmp_path: Path) -> None:
+    """Those of 2.0 to 2.3 s arrive at 2.35 s, within a microsecond: two of them are late."""
+    path = arriving(made, tmp_path / "x.rrd", {20: 0.35 + 0.9e-6, 21: 0.25, 22: 0.15})
+    said = [text for _, _, text in events(path)]
+    assert said == ["air: pole: 2 lists late, captured 2.00 to 2.10 s, arrived 2.35 s"]
+    assert lane(path) == [(2.0, "2 late"), (2.2, None)]
+
+
 def test_lists_that_follow_soon_are_told_together_and_the_last_one_has_no_next(made: Made, tmp_path: Path) -> None:
     """Every third list until 2.4 s: a row. Then one more, 1.1 s later; and all from 4.5 s on."""
     by_hand = dict.fromkeys([*range(0, 25, 3), 35, *range(46, 51)], LOST)

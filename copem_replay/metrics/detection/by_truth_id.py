@@ -1,7 +1,7 @@
 """First detection of an object by truth id: the objects of a list are known (ideal fusion, and the truth).
 
-With ideal fusion an object is in the fused list whenever it is in a list that has arrived, so the first detection is
-read off the lists themselves; every other fusion is judged by its own lists.
+With ideal fusion an object is in the fused list whenever the receiver takes in a list that holds it, so the first
+detection is read off the lists themselves; every other fusion is judged by its own lists.
 
 `confirm` counts captures, not messages: the object is confirmed when `hits` of `of` consecutive capture instants hold
 it, by the lists that have arrived. Captures of several units within half a list period are one instant. What confirms
@@ -10,13 +10,12 @@ in the lists of one unit alone confirms also where others have joined it, whatev
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
 
-from copem_replay.communication.arrivals import out_of_sequence
+from copem_replay.communication.arrivals import newer_arrives_s
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Tracks
 from copem_replay.metrics.config import Confirm
 
@@ -41,15 +40,12 @@ def detect(
     confirm: Confirm,
     count_earlier: bool,
     max_age_s: float,
-    partial: Collection[str] = (),
 ) -> Detections:
     """First detection of every episode, from the lists of all units heard (their arrival times are common to all runs).
 
-    `max_age_s` counts from capture, on top of a list's own way to the receiver. `partial`: units whose messages leave
-    objects out, so that a newer one takes nothing from one that it overtook; then one hit confirms.
+    Every list counts at the instant at which it is taken in, also beside or after a newer one of its unit. `max_age_s`
+    counts from capture, on top of a list's own way to the receiver.
     """
-    whole = np.array([name not in partial for name in heard.units], dtype=bool)[heard.frame_unit_ix]
-    heard = heard.with_values(arrives_s=np.where(whole & out_of_sequence(heard), np.inf, heard.arrives_s))
     captured_s = heard.row_captured_s
     order, bounds = _by_object(heard, found)
     not_before_s = np.full(len(found.object_ix), -np.inf) if count_earlier else found.onset_s - _TOLERANCE_S
@@ -57,15 +53,17 @@ def detect(
     out = Detections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
     # From when on a list is no longer gone by: at its greatest age, within a microsecond, it still is.
     arrives_s = heard.common_arrives_s
-    outdated_s = np.minimum(_superseded_s(heard), arrives_s + max_age_s + 2 * _TOLERANCE_S)[heard.frame_ix]
-    # One hit confirms at once, whatever the instants.
-    cluster = capture_instants(heard) if confirm.hits > 1 else np.zeros(len(heard.stamp_ns), dtype=np.int64)
+    outdated_s, cluster = arrives_s + max_age_s + 2 * _TOLERANCE_S, np.zeros(len(heard.stamp_ns), dtype=np.int64)
+    place, units_in_place = cluster, heard.frame_unit_ix
+    if confirm.hits > 1:  # one hit confirms at once, whatever the instants and what was there before
+        outdated_s, cluster = np.minimum(newer_arrives_s(heard), outdated_s), capture_instants(heard)
+        place, units_in_place = _by_unit(heard)
     rows = _Rows(
-        heard.valid, arrives_s[heard.frame_ix], captured_s, outdated_s, heard.row_unit_ix, cluster[heard.frame_ix],
-        heard.frame_ix,
+        heard.valid, arrives_s[heard.frame_ix], captured_s, outdated_s[heard.frame_ix], heard.row_unit_ix,
+        cluster[heard.frame_ix], place[heard.frame_ix],
     )  # fmt: skip
     stays = _Stays(order, bounds, not_before_s, found.ended_s + _TOLERANCE_S)
-    _first(rows, heard.frame_unit_ix, stays, confirm.hits, confirm.of, out)
+    _first(rows, units_in_place, stays, confirm.hits, confirm.of, out)
     return out
 
 
@@ -97,6 +95,16 @@ def shortest_period_s(heard: Tracks) -> float:
     return min(medians_s.tolist(), default=0.0)
 
 
+def _by_unit(heard: Tracks) -> tuple[Int, Int]:
+    """(F,) places of lists, unit by unit in order of capture, those that never arrive last; the unit at each, (F,)."""
+    came = np.isfinite(heard.common_arrives_s)
+    unit = np.where(came, heard.frame_unit_ix, len(heard.units))  # what never arrives is no capture to the receiver
+    order = np.lexsort((heard.captured_s, unit))
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    return place, unit[order]
+
+
 def _by_object(heard: Tracks, found: Episodes) -> tuple[Int, Int]:
     """Rows of each episode in order of arrival, then of the units: (rows,), and where each episode's begin (M + 1,)."""
     # One place more than there are objects: index −1, no truth id, has no episode.
@@ -118,16 +126,6 @@ def _by_object(heard: Tracks, found: Episodes) -> tuple[Int, Int]:
     return rows, np.searchsorted(episode[rows], np.arange(len(found.object_ix) + 1))
 
 
-def _superseded_s(heard: Tracks) -> Float:
-    """(F,) when the next list of the same unit arrives; inf for its last."""
-    result = np.full(len(heard.stamp_ns), np.inf)
-    came = np.flatnonzero(np.isfinite(heard.common_arrives_s))
-    came = came[np.argsort(heard.frame_unit_ix[came], kind="stable")]
-    same = heard.frame_unit_ix[came[1:]] == heard.frame_unit_ix[came[:-1]]
-    result[came[:-1][same]] = heard.common_arrives_s[came[1:][same]]
-    return result
-
-
 @nb.njit(cache=True, nogil=True)
 def _cluster(captured_s: Float, unit_ix: Int, last_of: Int, reach_s: float, order: Int, out: Int) -> None:
     current, first = -1, -np.inf
@@ -145,7 +143,7 @@ class _Rows(NamedTuple):
     outdated_s: Float
     unit_ix: Int
     cluster: Int  # the capture instant
-    frame_ix: Int
+    place: Int  # of its list among those of its unit
 
 
 class _Stays(NamedTuple):
@@ -157,12 +155,12 @@ class _Stays(NamedTuple):
 
 
 @nb.njit(cache=True, nogil=True)
-def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, out: Detections) -> None:
-    valid, arrives_s, captured_s, outdated_s, unit_ix, cluster, frame_ix = rows
+def _first(rows: _Rows, units_in_place: Int, stays: _Stays, hits: int, of: int, out: Detections) -> None:
+    valid, arrives_s, captured_s, outdated_s, unit_ix, cluster, place = rows
     order, bounds, not_before_s, until_s = stays
     detection_s, newest_s, first_unit_ix = out
     held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
-    no_group = np.zeros(len(frame_unit_ix), dtype=np.int64)
+    no_group = np.zeros(len(units_in_place), dtype=np.int64)
     # Which instants hold the object; a token per episode and run spares clearing them.
     by_instant, by_list = no_group.copy(), no_group.copy()
     token = 0
@@ -179,10 +177,10 @@ def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, o
                 held[n] = p
                 n += 1
                 if hits > 1:
-                    by_instant[cluster[p]] = by_list[frame_ix[p]] = token
+                    by_instant[cluster[p]] = by_list[place[p]] = token
                     if not (
                         _confirmed(by_instant, token, cluster[p], hits, of, no_group)
-                        or _confirmed(by_list, token, frame_ix[p], hits, of, frame_unit_ix)
+                        or _confirmed(by_list, token, place[p], hits, of, units_in_place)
                     ):
                         continue
                 detection_s[s, m] = arrives_s[p]
@@ -196,8 +194,9 @@ def _first(rows: _Rows, frame_unit_ix: Int, stays: _Stays, hits: int, of: int, o
                     if valid[s, q]:
                         newest = max(newest, captured_s[q])
                 for j in range(n):
-                    if outdated_s[held[j]] > arrives_s[p] + 1e-6:
-                        newest = max(newest, captured_s[held[j]])
+                    q = held[j]
+                    if outdated_s[q] > arrives_s[p] + 1e-6 or arrives_s[q] > arrives_s[p] - 1e-6:
+                        newest = max(newest, captured_s[q])
                 newest_s[s, m] = newest
                 break
 
