@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from copem_replay.cli.options import ExperimentFile, listed
-from copem_replay.cli.terminal import note, say, say_blocks
+from copem_replay.cli.terminal import complain, note, say, say_blocks
 
 
 def fit(
@@ -41,7 +41,7 @@ def fit(
     """Fit a perception error model to recorded lists.
 
     Every number comes with an interval, or with the reason why the data cannot determine it. The exit code is 1 if the
-    fitted model fails its replay check.
+    fitted model fails its replay check, or a page cannot be written.
     """
     from copem_replay.cli.api.fit import fill, fitted, how_of, study_to_fit
     from copem_replay.experiment.file import load
@@ -57,7 +57,9 @@ def fit(
         found = fitted(study, unit, how)
         fill(place, found)
         note([*place.notes, *found.notes])
+        complain(place.failed)
         say_blocks([table_lines(found.found)])
         say(f"the model is in {place.shown / PEM}")
     say(f"next: copem-replay run {shlex.quote(str(place.shown / EXPERIMENT))}")
-    return 1 if found.found.checks is not None and found.found.checks.fails else 0
+    unlike = found.found.checks is not None and found.found.checks.fails
+    return 1 if unlike or place.failed else 0

@@ -1,7 +1,7 @@
 """The command line: the commands of this folder, and one place where errors become exit codes.
 
-0 done · 1 done, but a log was skipped, or a fitted model is unlike what was recorded · 2 the input was wrong: plain
-lines on stderr · 70 internal error: traceback · 130 interrupted.
+0 done · 1 done, but a log was skipped, a replay or page could not be written, or a fitted model is unlike what was
+recorded · 2 the input was wrong: plain lines on stderr · 70 internal error: traceback · 130 interrupted.
 """
 
 from __future__ import annotations

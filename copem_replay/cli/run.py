@@ -95,6 +95,7 @@ def run(
             complain([f"pieces: {kept.computed} computed, {kept.found} found in {kept.store.where}"])
         skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
         note([*place.notes, *skipped, *notes, *costs])
+        complain(place.failed)
         print(summary_text(result.summary, width_of(sys.stdout)))
         if result.sweep is not None:
             say(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {place.shown / 'sweep.csv'}")
@@ -104,7 +105,7 @@ def run(
 
             say(f"report in {write_report(place.shown)}")
     say(f"next: copem-replay {'view' if recordings_of(place.shown) else 'report'} {shlex.quote(str(place.shown))}")
-    return 1 if study.skipped else 0
+    return 1 if study.skipped or place.failed else 0
 
 
 def _viewer(experiment: Experiment, url: str | None) -> str:

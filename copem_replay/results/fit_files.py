@@ -35,7 +35,10 @@ Page = Callable[[Path, Fit], None]
 def fill_fit(
     place: Place, fit: Fit, experiment: Experiment, recordings: Sequence[Recording], pages: Mapping[str, Page]
 ) -> None:
-    """Write a fit into a place that is taken. `pages`: further files by their names. Raises OutputError."""
+    """Write a fit into a place that is taken. `pages`: further files by their names. Raises OutputError.
+
+    `failed` of the place: pages that could not be written.
+    """
     files = sorted([PEM, EXPERIMENT, ROWS, ESTIMATES, MARK, *pages])
     replayed = [one for one in recordings if one.scene.log in (fit.held_out or fit.logs)]
     made = versions() | {"format": "fit", "unit": fit.unit, "logs": said_of_logs(recordings), "notes": list(fit.said)}
@@ -48,7 +51,9 @@ def fill_fit(
         write_parquet(rows_table(fit, recordings), new / ROWS)
         (new / ESTIMATES).write_text(_json(estimates(fit) | {"provenance": made}), encoding="utf-8")
         for name, page in pages.items():
-            page(new / name, fit)
+            with place.may_fail([name]):
+                page(new / name, fit)
+        files = [name for name in files if name not in place.left_out]
         (new / MARK).write_text(_json(made | {"files": files}), encoding="utf-8")
         place.finish(files)
     except OSError as error:

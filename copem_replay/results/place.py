@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import errno
 import os
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from copem_replay.core.errors import OutputError
+from copem_replay.core.errors import CopemError, OutputError
 from copem_replay.core.scratch import OLD, Scratch, flush, flush_all, remove_leftovers, scratch_for
 from copem_replay.results.belongings import Belongings, belongings, keep, names_in
 from copem_replay.results.exchange import exchange
@@ -35,6 +36,8 @@ class Place:
     scratch: Scratch
     before: os.stat_result | None  # the folder that is to be replaced, as it was at the start
     notes: list[str] = field(default_factory=list)  # what has to be said of this place, and not of the results
+    failed: list[str] = field(default_factory=list)  # what could not be written that the results are complete without
+    left_out: set[str] = field(default_factory=set)  # the names of these files
 
     @property
     def shown(self) -> Path:
@@ -49,6 +52,34 @@ class Place:
     def will_hold(self, files: Sequence[str]) -> None:
         """Say what the results are going to be, before any of it is written. Raises OSError."""
         self.scratch.will_hold([_SPARE, *(f"{_NEW}/{name}" for name in files)])
+
+    @contextmanager
+    def may_fail(self, names: Sequence[str]) -> Iterator[None]:
+        """Write files that the results are complete without. Whatever goes wrong is `failed`, and they are left out."""
+        try:
+            yield
+        except Exception as error:  # also a defect: it must not cost what hours have computed
+            for path in (self.new / name for name in names):
+                path.unlink(missing_ok=True)
+                _without([parent for parent in path.parents if self.new in parent.parents])
+            self.left_out.update(names)
+            shown = [str(self.asked / name) for name in names]
+            why = self._reason(error)
+            for name in shown:
+                why = why.removeprefix(f"{name}: ")
+            self.failed.append(f"{', '.join(shown)}: not written ({why}); all other results are there")
+
+    def _reason(self, error: Exception) -> str:
+        """Why something could not be written, in a line."""
+        if isinstance(error, CopemError):
+            return "; ".join(error.problems).replace(str(self.new), str(self.asked))
+        if isinstance(error, OSError):
+            return error.strerror or str(error)
+        if isinstance(error, MemoryError):
+            return "not enough memory"
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        said = " ".join(f"{type(error).__name__}: {error}".split())
+        return f"internal error, please report it: {said}, in {Path(at.filename).name}, line {at.lineno}"
 
     def finish(self, files: Sequence[str]) -> None:
         """Give the new folder its name: what is there goes when all of the new one is on the disk. Raises OSError."""

@@ -45,7 +45,7 @@ def write_results(
     skipped: Sequence[tuple[File, str]] = (),
     overwrite: bool = False,
 ) -> list[str]:
-    """Write the results folder. Returns notes for the user. Raises OutputError.
+    """Write the results folder. Returns notes for the user. Raises OutputError, also where only exporters failed.
 
     `exporters`: each writes every shown run (`show` in the experiment) as a file, `MCAP` and `RRD` for instance.
     `skipped`: recordings that are left out, and why.
@@ -53,7 +53,9 @@ def write_results(
     with taken(folder, overwrite=overwrite) as place:
         check_inputs(place, [path for recording in recordings for path in recording.paths])
         notes = fill_place(place, experiment, recordings, result, exporters=exporters, skipped=skipped)
-        return place.notes + notes
+    if place.failed:
+        raise OutputError(place.failed)
+    return place.notes + notes
 
 
 def fill_place(
@@ -65,11 +67,16 @@ def fill_place(
     exporters: Sequence[Exporter],
     skipped: Sequence[tuple[File, str]] = (),
 ) -> list[str]:
-    """The same into a place that is taken, whose `folder` and `notes` may change. Raises OutputError."""
+    """Write results into a place that is taken. Returns notes for the user. Raises OutputError.
+
+    The place's `folder` and `notes` may change; `failed`: exporters' files that could not be written.
+    """
     files = _files(experiment, recordings, result, exporters)
     try:
         place.will_hold(files)
-        notes = _fill(place, experiment, recordings, result, exporters)
+        _fill(place, experiment, recordings, result)
+        notes = [*result.notes, *_export(place, experiment, recordings, result, exporters)]
+        files = [name for name in files if name not in place.left_out]
         write_csv(_logs(place.folder, result, skipped), place.new / "logs.csv")
         provenance = provenance_of(experiment, recordings, result, skipped, notes) | {"files": files}
         (place.new / MARK).write_text(json.dumps(provenance, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -108,10 +115,8 @@ def _target(shown: ShownRun, log: str, recordings: Sequence[Recording]) -> str:
     return shown.stem if len(recordings) == 1 else f"{shown.stem}/{log}"
 
 
-def _fill(
-    place: Place, experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
-) -> list[str]:
-    """Write all files but the provenance. Returns notes for the user."""
+def _fill(place: Place, experiment: Experiment, recordings: Sequence[Recording], result: Result) -> None:
+    """Write the experiment and all tables but that of the logs."""
     data, scratch = resolved(experiment).as_written(), place.new
     data["logs"] = log_entries(experiment.logs, recordings, place.folder)
     for of in _recorded_latencies(data):
@@ -125,14 +130,24 @@ def _fill(
         write_csv(result.bands, scratch / "bands.csv")
     if result.sweep is not None:
         write_csv(result.sweep, scratch / "sweep.csv")
-    notes = list(result.notes)
+
+
+def _export(
+    place: Place, experiment: Experiment, recordings: Sequence[Recording], result: Result, exporters: Sequence[Exporter]
+) -> list[str]:
+    """Write the runs that are shown. Returns notes for the user; what cannot be written is among those that failed."""
+    notes: list[str] = []
     for log in shown_logs(experiment, result) if exporters else ():
         for shown in shown_runs(experiment, result, log):
-            target = scratch / _target(shown, log, recordings)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            run = _run_to_export(log, shown, experiment, recordings, result)
-            said = [line for exporter in exporters for line in exporter.write(Path(f"{target}{exporter.suffix}"), run)]
-            notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
+            stem, shown_count = _target(shown, log, recordings), len(experiment.shown())
+            files = [exporter.files(stem, shown_count) for exporter in exporters]
+            with place.may_fail([name for names in files for name in names]):
+                run = _run_to_export(log, shown, experiment, recordings, result)
+                (place.new / stem).parent.mkdir(parents=True, exist_ok=True)
+                for exporter, names in zip(exporters, files, strict=True):
+                    with place.may_fail(names):
+                        said = exporter.write(place.new / f"{stem}{exporter.suffix}", run)
+                        notes += [f"{log}: {line}" for line in said if f"{log}: {line}" not in notes]
         next(one for one in result.logs if one.name == log).drop()
     return notes
 

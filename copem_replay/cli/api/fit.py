@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from copem_replay.cli.api.study import AnyExperiment, AnyPath, Study, read_study, source_of
-from copem_replay.core.errors import ExperimentError, InputError
+from copem_replay.core.errors import ExperimentError, InputError, OutputError
 from copem_replay.core.text import counted
 from copem_replay.experiment.file import Source
 from copem_replay.experiment.schema import Experiment
@@ -71,7 +71,8 @@ class FittedPem:
     def save(self, folder: AnyPath, overwrite: bool = False) -> Path:
         """Write the folder of the fit, complete or not at all. Returns its path.
 
-        Raises OutputError: the folder holds something already (`overwrite` replaces a fit), or is not writable.
+        Raises OutputError: the folder holds something already (`overwrite` replaces a fit), or is not writable; also
+        where a page could not be written, and the rest of the fit is there.
         """
         from copem_replay.results.place import check_inputs, taken
 
@@ -79,6 +80,8 @@ class FittedPem:
             check_inputs(place, [path for recording in self.recordings for path in recording.paths])
             fill(place, self)
             self.folder = place.shown
+        if place.failed:
+            raise OutputError(place.failed)
         return place.shown
 
 

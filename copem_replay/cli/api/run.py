@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from copem_replay.cli.api.study import AnyExperiment, AnyPath, AnyRecordings, Study, prepared, study_of
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES
@@ -96,7 +96,8 @@ class StudyResult:
     def save(self, folder: AnyPath, overwrite: bool = False) -> Path:
         """Write the results folder, complete or not at all. Returns its path.
 
-        Raises OutputError: the folder holds something already (`overwrite` replaces results), or is not writable.
+        Raises OutputError: the folder holds something already (`overwrite` replaces results), or is not writable; also
+        where a replay could not be written, and all other results are there.
 
         >>> result.save("out/example", overwrite=True).name
         'example'
@@ -107,6 +108,8 @@ class StudyResult:
             check_inputs(place, [path for recording in self.recordings for path in recording.paths])
             fill(place, self)
             self.folder = place.shown
+        if place.failed:
+            raise OutputError(place.failed)
         return place.shown
 
 

@@ -78,7 +78,10 @@ def write_mcap(
     `window`: of `source` that was read, None: all. `truth`: to be drawn beside them, None: not drawn; nor where a
     configuration has the name of its topics. `colours`: by configuration, None: by their places in `run_tracks`.
 
-    Returns notes on what could not be copied, or was replaced.
+    Where lists or frames of the truth are from before 0, which MCAP cannot say, all messages that are added are logged
+    so much later that the first of them is at 0; what is in messages goes by the log's clock.
+
+    Returns notes on what could not be copied, was replaced, or is logged later.
 
     Raises OutputError when the file cannot be written, RecordingError when `source` can no longer be read.
     """
@@ -105,6 +108,7 @@ def write_mcap(
         del first
         chunks = chain([begun], ([*lists_of(c), *besides(c)] for c in rest))
         added = _in_order([chain.from_iterable(_in_order(streams) for streams in chunks), *shown])
+        added, later_ns = _from_zero_on(added)
         _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for message in _made_ahead(_in_order([messages, added])):
             writer.add_message(
@@ -112,7 +116,25 @@ def write_mcap(
             )
     replaced = sorted(ours & {channel.topic for channel in original.channels.values()})
     notes = [f"{len(replaced)} topics of an earlier replay are replaced ({replaced[0]} …)"] if replaced else []
+    if later_ns:
+        notes.append(
+            f"times before 0 cannot be written: the messages of {path.name} that are added to the recording's are "
+            f"logged {later_ns / 1e9:.9g} s later; their stamps are as they were"
+        )
     return [*([original.damage] if original.damage else []), *notes]
+
+
+def _from_zero_on(messages: Iterator[Message]) -> tuple[Iterator[Message], int]:
+    """Messages in order, none of them logged before 0, and how many ns later than before they are logged."""
+    first = next(messages, None)
+    if first is None or first.log_time >= 0:
+        return chain([] if first is None else [first], messages), 0
+    later_ns = -first.log_time
+    return (_logged_later(message, later_ns) for message in chain([first], messages)), later_ns
+
+
+def _logged_later(m: Message, later_ns: int) -> Message:
+    return Message(m.channel_id, m.log_time + later_ns, m.data, m.publish_time + later_ns, m.sequence)
 
 
 def _add_records(writer: Writer, original: Source, osi: bool, manifest: Mapping[str, str]) -> None:
