@@ -2,9 +2,10 @@
 
 Half of the moments are numbered steps (a file opened, a folder made, a name given or taken where the results go: what
 Python tells its audit hooks of), half random times. After each kill, the results folder is either what it was or what
-it was going to be, and a file of the user's is in it; a run after that gives the same bytes as ever, and leaves nothing
-beside the folder. The .rrd, whose bytes differ from run to run, has to be there. `--two-steps`: as where folders cannot
-be exchanged; then, for an instant, nothing has the folder's name, and the next run puts it back.
+it was going to be, and a file of the user's is in it; a page that was made of the old results is there with them and
+gone with them. A run after that gives the same bytes as ever, and leaves nothing beside the folder. The .rrd, whose
+bytes differ from run to run, has to be there. `--two-steps`: as where folders cannot be exchanged; then, for an
+instant, nothing has the folder's name, and the next run puts it back.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 _STEPS = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", "os.scandir"}
-_NOTE = "notes.txt"
+_NOTE, _PAGE = "notes.txt", "page.html"
 Files = dict[str, bytes]
 
 
@@ -112,8 +113,18 @@ class Trial:
         paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
         return {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
 
+    def add_files(self) -> None:
+        """A file of the user's, and one that was made of the results, as `report` makes it."""
+        from copem_replay.results.belongings import list_made
+
+        (self.out / _NOTE).write_text("mine\n")
+        list_made(self.out, [self.out / _PAGE])
+        (self.out / _PAGE).write_text("of the old results\n")
+
     def check(self, seeds: tuple[int | None, int], found: Found, what: str) -> None:
         """What a killed run left: it is that of one of two seeds (None: there was nothing)."""
+        from copem_replay.results.belongings import MADE
+
         found.leftovers += len(os.listdir(self.out.parent)) > self.out.exists() if self.out.parent.exists() else 0
         before, seed = seeds
         files = self.files()
@@ -124,6 +135,9 @@ class Trial:
         mine = files.pop(_NOTE, None)
         if before is not None and mine != b"mine\n":
             found.wrong.append(f"{what}: {_NOTE} is gone")
+        made = [files.pop(name) for name in (_PAGE, MADE) if name in files]
+        if len(made) != (2 if before is not None and files == self.expected[before] else 0):
+            found.wrong.append(f"{what}: {_PAGE} is beside other results than its own, or gone without them")
         if files == self.expected[seed]:
             found.new += 1
         elif before is not None and files == self.expected[before]:
@@ -174,11 +188,11 @@ def kill(
     for number in (1, 2):
         trial.run(number)
         trial.expected[number] = trial.files()
-    (trial.out / _NOTE).write_text("mine\n")
     begin = time.perf_counter()
     trial.run(2)
     takes_s = time.perf_counter() - begin
     steps = trial.steps(2)
+    trial.add_files()
     ends = [k * steps // (kills // 2) for k in range(kills // 2 + 1)]
     counted = [rng.randrange(low, max(high, low + 1)) for low, high in pairwise(ends)]
     moments: list[int | float] = [*counted, *(rng.uniform(0, takes_s) for _ in range(kills - len(counted)))]
@@ -202,7 +216,7 @@ def kill(
         found.unscathed += ended(child) is not None
         trial.check((there, new), found, what)
         trial.look_again((there, new), found, what)
-        (trial.out / _NOTE).write_text("mine\n")
+        trial.add_files()
         there = new
         if progress:
             print(f"{what}: {found}", flush=True)

@@ -63,7 +63,7 @@ def compare(
     note(notes)
     say_blocks([comparison_text(comparison, width_of(sys.stdout)).splitlines()])
     if out is not None:
-        write_comparison(comparison, out)
+        write_comparison(comparison, out, folders)
     for file in (out, rrd):
         if file is not None:
             tidied(file)
@@ -135,12 +135,15 @@ def layout(
     """
     from copem_replay.core.files import atomic_file
     from copem_replay.io.write.foxglove_layout import layout_of
+    from copem_replay.results.belongings import MARK, list_made
 
     replay = folder / "replay.mcap" if folder.is_dir() else folder
     made = layout_of(replay, listed(configurations) or ())
     path = out or replay.with_suffix(".foxglove.json")
+    of_results = next((place for place in replay.absolute().parents if (place / MARK).is_file()), replay.parent)
     with atomic_file(path) as scratch:
         scratch.write_text(json.dumps(made, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        list_made(of_results, [path])
     say(f"layout in {path}")
     return 0
 

@@ -66,10 +66,10 @@ class Scratch:
         """
         self._say({"files": sorted(files), "same": same or {}})
 
-    def add_same(self, name: str, beside: str) -> None:
-        """One more that may be removed if it is equal to a file beside the scratch folder."""
-        files, same = _listed(self.path)
-        self._say({"files": sorted(files), "same": same | {name: beside}})
+    def add(self, files: Iterable[str] = (), same: Mapping[str, str] | None = None) -> None:
+        """More of what is going to be in it."""
+        known, known_same = _listed(self.path)
+        self.will_hold(known.union(files), known_same | dict(same or {}))
 
     def _say(self, what: object) -> None:
         data = json.dumps(what).encode()

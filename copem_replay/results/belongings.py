@@ -1,11 +1,15 @@
-"""Files that belong to a results folder, and go when new results take its place; the rest stays."""
+"""Files that belong to a results folder, and go when new results take its place; the rest stays.
+
+Those of the results are listed in `provenance.json`, those that commands made of them in `made.jsonl`.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterator
+import stat
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,24 +18,27 @@ from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.scratch import is_scratch
 
 MARK = "provenance.json"
-_FIGURES = ("runs", "curves", "one_by_one", "distances", "latency_breakdown", "sweeps")
-_MADE_OF_RESULTS = {
-    "report.html",
-    *(f"figures/{name}.{kind}" for name in _FIGURES for kind in ("png", "svg")),
-}
-"""What `report` and `plot` make: not in the list of files, and true of the results they were made of alone."""
+MADE = "made.jsonl"
+"""In a results folder: the names of files that commands made of the results later, a JSON string a line.
+
+Lines are only ever added, so that two commands at a time lose none, and a line that is half-written is no name.
+"""
 
 
 @dataclass(frozen=True)
 class Belongings:
-    """What is in a results folder, by names relative to it. `ours` is None where it does not say (an older version)."""
+    """What is in a results folder, by names relative to it.
 
-    ours: frozenset[str] | None
+    `results`: None where it does not say (an older version). `made`: of the results, afterwards.
+    """
+
+    results: frozenset[str] | None
+    made: frozenset[str]
     every: tuple[str, ...]  # files, links, empty folders
 
     def others(self, written: Collection[str]) -> list[str]:
         """The user's own files; `written`: what the new results are. A folder that does not say has the same."""
-        ours = (self.ours if self.ours is not None else frozenset(written)) | _MADE_OF_RESULTS
+        ours = (self.results if self.results is not None else frozenset(written)) | self.made
         return [name for name in self.every if name not in ours]
 
 
@@ -44,7 +51,60 @@ def belongings(folder: Path) -> Belongings | None:
     if not isinstance(said, dict) or "copem_replay" not in said:
         return None
     listed = said.get("files")
-    return Belongings(frozenset(map(str, listed)) if isinstance(listed, list) else None, tuple(names_in(folder)))
+    results = frozenset(map(str, listed)) if isinstance(listed, list) else None
+    return Belongings(results, made_in(folder), tuple(names_in(folder)))
+
+
+def made_in(folder: Path) -> frozenset[str]:
+    """What is listed as made of the results of a folder, and the list itself. No name in it leads anywhere.
+
+    They are compared with names that are there, and never opened: a list may say whatever it likes.
+    """
+    found = {MADE}
+    for line in _listed(folder).splitlines():
+        try:
+            name = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(name, str):
+            found.add(name)
+    return frozenset(found)
+
+
+def list_made(folder: Path, files: Iterable[Path]) -> None:
+    """List those of some files that lie in a results folder as made of its results: with them they go.
+
+    To be called before a file has its name, so that no process that is killed leaves one that is not listed.
+    Raises OutputError.
+    """
+    root = os.path.realpath(folder)
+    if not os.path.isfile(os.path.join(root, MARK)):
+        return
+    places = [os.path.join(os.path.realpath(file.parent), file.name) for file in files]
+    names = {os.path.relpath(place, root) for place in places if place.startswith(f"{root}{os.sep}")}
+    if not (new := sorted(names - made_in(folder))):
+        return
+    begun = _listed(folder)[-1:] not in (b"", b"\n")  # by a process that was killed
+    text = "\n" * begun + "".join(f"{json.dumps(name)}\n" for name in new)
+    try:
+        fd = os.open(folder / MADE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        try:
+            os.write(fd, text.encode())
+            os.fsync(fd)
+        finally:
+            os.close(fd)
+    except OSError as error:
+        raise OutputError(f"{folder / MADE}: cannot be written: {error.strerror or error}") from None
+
+
+def _listed(folder: Path) -> bytes:
+    """The content of the list; nothing where there is none, or something else in its place."""
+    try:
+        fd = os.open(folder / MADE, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with open(fd, "rb") as file:
+            return file.read() if stat.S_ISREG(os.fstat(fd).st_mode) else b""
+    except OSError:
+        return b""
 
 
 def check_still(folder: Path, seen: os.stat_result) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from copem_replay.core.errors import CopemError, OutputError
 from copem_replay.core.scratch import OLD, Scratch, flush, flush_all, remove_leftovers, scratch_for
-from copem_replay.results.belongings import Belongings, belongings, keep, names_in
+from copem_replay.results.belongings import Belongings, belongings, keep, made_in, names_in
 from copem_replay.results.exchange import exchange
 from copem_replay.results.lock import only_writer
 
@@ -138,12 +138,15 @@ class Place:
         return kept
 
     def _keep_late(self, old: Path, held: Belongings, kept: dict[str, str]) -> None:
-        """What came into the old folder while the new one took its place."""
-        for name in names_in(old):
-            if name not in held.every:
+        """What came into the old folder while the new one took its place: what was made of the old results goes."""
+        made = made_in(old)
+        late = [name for name in names_in(old) if name not in held.every]
+        self.scratch.add([f"{old.name}/{name}" for name in made.intersection(late)])
+        for name in late:
+            if name not in made:
                 with suppress(OSError):
                     kept[name] = keep(name, old, self.folder, self.scratch.path / _SPARE)
-                    self.scratch.add_same(f"{old.name}/{name}", f"{self.folder.name}/{kept[name]}")
+                    self.scratch.add(same={f"{old.name}/{name}": f"{self.folder.name}/{kept[name]}"})
 
     def _elsewhere(self, why: str) -> None:
         """Give the new folder another name."""
@@ -275,7 +278,7 @@ def check_inputs(place: Place, inputs: Sequence[Path]) -> None:
     if place.before is None:
         return
     held = belongings(place.folder)
-    ours = None if held is None else held.ours
+    ours = None if held is None or held.results is None else held.results | held.made
     for path in inputs:
         if not path.resolve().is_relative_to(place.folder):
             continue

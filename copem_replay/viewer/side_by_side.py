@@ -20,12 +20,14 @@ from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.pipeline.blocks import replay_block
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.selected_runs import STEM, OneRun, one_run
+from copem_replay.results.belongings import list_made
 from copem_replay.results.compare.comparable import check_comparable
 from copem_replay.results.compare.inputs import read_folders
 from copem_replay.results.compare.labels import Named, chosen, named
 from copem_replay.results.read import Results, complete
 from copem_replay.results.reread import read_again
 from copem_replay.viewer.merge_experiments import Part, merged
+from copem_replay.viewer.selection import in_parts
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ def write_beside(
         side.labels[name]: fused_tracks for side in sides for name, fused_tracks in side.one.run_tracks.whole().items()
     }
     table = pd.concat([side.rows.assign(configuration=side.rows["configuration"].map(side.labels)) for side in sides])
+    for folder in folders:
+        list_made(folder, [part.path(path) for part in in_parts([one.label for one in wanted], wanted[0].label)])
     write_rrd(
         path,
         prepare(recording, experiment, onsets_of=of_log(sides[0].results.experiment, log)),

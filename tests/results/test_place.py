@@ -40,6 +40,7 @@ def old(here: Path, call: Call) -> Path:
     (folder / "figures/more/mine.svg").write_text("<svg/>")
     (folder / "figures/runs.png").write_text("of the old results")
     (folder / "report.html").write_text("of the old results")
+    belongings.list_made(folder, [folder / "figures/runs.png", folder / "report.html"])  # as `plot` and `report` do
     (folder / "empty").mkdir()
     (folder / "link").symlink_to("../../drive.mcap")
     return folder
@@ -159,6 +160,153 @@ class TestOthers:
         drive(old / "mine.mcap")
         assert again(call, "--log", "out/e/mine.mcap").code == 0
         assert (old / "mine.mcap").exists()
+
+
+EVERYTHING = changed(
+    "show: {run: [worst, 1]}",
+    "sweep: {latency_s: [0, 0.2]}",
+    "measure: {onset: {kind: in_range, range_m: 60}, exact: true}",
+)
+
+
+class TestMade:
+    """What commands make of results is listed in their folder, and goes with them."""
+
+    def test_of_every_file_that_any_command_writes_none_outlives_its_results(self, here: Path, call: Call) -> None:
+        (here / "e.yaml").write_text(EVERYTHING)
+        configurations = "configurations:\n" + "".join(
+            f"  late{k}: {{units: all, latency_s: 0.{k}}}\n" for k in range(4)
+        )
+        (here / "e.yaml").write_text(EVERYTHING.replace("configurations:\n", configurations))
+        assert call("run", "e.yaml", "--report").code == 0
+        folder = here / "out/e"
+        commands = [
+            ["plot", "out/e"],
+            ["plot", "out/e", "--out", "out/e/more figures", "--configurations", "GT,PEM"],
+            ["report", "out/e"],
+            ["report", "out/e", "--out", "out/e/pages/second.html", "--baseline", "PEM"],
+            ["layout", "out/e"],
+            ["layout", "out/e/replay_1.mcap", "--out", "out/e/wide.json", "--compare", "GT,PEM"],
+            ["compare", "out/e", "--baseline", "PEM", "--out", "out/e/c.csv", "--rrd", "out/e/beside.rrd"],
+            ["compare", "out/e", "--baseline", "PEM", "--out", "out/e/c.md"],
+        ]
+        for command in commands:
+            assert call(*command).code == 0, command
+        results = set(json.loads((folder / "provenance.json").read_text())["files"])
+        assert {"sweep.csv", "exact.parquet", "bands.csv", "replay_1.rrd", "replay.configurations_7.rrd"} <= results
+        made = set(belongings.names_in(folder)) - results
+        assert {
+            f"figures/{name}.{kind}" for name in ("answer", "differences", "sweeps") for kind in ("png", "svg")
+        } <= made
+        assert {"report.html", "pages/second.html", "replay.foxglove.json", "wide.json"} <= made
+        assert {"c.csv", "c.md", "beside.rrd", "beside.configurations_7.rrd", "more figures/curves.svg"} <= made
+        (folder / "figures/mine.svg").write_text("<svg/>")
+        (folder / "notes.txt").write_text("mine\n")
+        (here / "e.yaml").write_text(TEXT.replace("probability: 0.5", "probability: 0.9"))
+        assert call("run", "e.yaml", "--overwrite").lines == []
+        results = set(json.loads((folder / "provenance.json").read_text())["files"])
+        assert set(belongings.names_in(folder)) == results | {"figures/mine.svg", "notes.txt"}
+        assert os.listdir(here / "out") == ["e"]
+
+    def test_of_other_results_stays(self, here: Path, call: Call) -> None:
+        """A page of other results is no older than before, wherever it was put."""
+        for out in ("out/e", "out/other"):
+            assert call("run", "e.yaml", "--out", out).code == 0
+        assert call("report", "out/other", "--out", "out/e/other.html").code == 0
+        assert call("report", "out/e", "--out", "out/other/e.html").code == 0
+        assert call("compare", "out/e", "out/other", "--baseline", "e:PEM", "--out", "out/other/c.csv").code == 0
+        assert again(call).code == 0
+        assert call("run", "e.yaml", "--out", "out/other", "--overwrite").code == 0
+        assert (here / "out/e/other.html").exists()
+        assert (here / "out/other/e.html").exists()
+        assert not (here / "out/other/c.csv").exists()
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "../keep.txt", "/keep.txt", "{here}/out/keep.txt", "{here}/out/e/notes.txt", "figures/../notes.txt",
+            "link/a", "./notes.txt", "elsewhere/keep.txt", ".", "", "..", "figures",
+        ],
+    )  # fmt: skip
+    def test_a_list_that_names_what_is_not_in_the_folder_removes_nothing(
+        self, old: Path, call: Call, text: str
+    ) -> None:
+        (old.parent / "keep.txt").write_text("keep\n")
+        (old / "elsewhere").symlink_to(old.parent)
+        with (old / "made.jsonl").open("a") as file:
+            file.write(json.dumps(text.format(here=old.parents[1])) + "\n")
+        assert again(call).lines == []
+        assert (old.parent / "keep.txt").read_text() == "keep\n"
+        assert (old / "notes.txt").read_text() == "mine\n"
+        assert (old / "elsewhere").is_symlink()
+        assert set(belongings.names_in(old)) - set(json.loads((old / "provenance.json").read_text())["files"]) == {
+            *MINE, "elsewhere",
+        }  # fmt: skip
+        assert sorted(os.listdir(old.parent)) == ["e", "keep.txt"]
+
+    @pytest.mark.parametrize("content", [b"\xff\xfe\n", b"[" * 100_000, b'{"a": 1}\n3\nnull\n', b"", b'"notes.tx'])
+    def test_a_damaged_list_names_nothing_but_what_can_be_read_of_it(
+        self, old: Path, call: Call, content: bytes
+    ) -> None:
+        with (old / "made.jsonl").open("ab") as file:
+            file.write(content)
+        assert call("layout", "out/e").code == 2  # shows nothing: writes nothing
+        assert call("report", "out/e", "--out", "out/e/late.html").code == 0
+        assert again(call).lines == []
+        assert set(belongings.names_in(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
+
+    @pytest.mark.parametrize("kind", ["link", "folder", "pipe"])
+    def test_something_else_in_the_place_of_the_list(self, here: Path, call: Call, kind: str) -> None:
+        assert call("run", "e.yaml").code == 0
+        place, outside = here / "out/e/made.jsonl", here / "outside.txt"
+        outside.write_text('"summary.csv"\n')
+        if kind == "link":
+            place.symlink_to(outside)
+        elif kind == "folder":
+            place.mkdir()
+        else:
+            os.mkfifo(place)
+        ended = call("report", "out/e")
+        assert (ended.code, len(ended.lines)) == (2, 1)
+        assert ended.lines[0].startswith("out/e/made.jsonl: cannot be written: ")
+        assert not (here / "out/e/report.html").exists()
+        assert outside.read_text() == '"summary.csv"\n'
+        assert again(call).code == 0
+        assert outside.exists()
+
+    def test_what_is_made_while_the_folder_is_exchanged_goes_with_the_old_results(
+        self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        exchange = place.exchange
+
+        def late(one: Path, other: Path) -> bool:
+            belongings.list_made(other, [other / "late.html"])
+            (other / "late.html").write_text("of the old results")
+            return exchange(one, other)
+
+        monkeypatch.setattr(place, "exchange", late)
+        assert again(call).lines == []
+        assert set(belongings.names_in(old)) == MINE | set(json.loads((old / "provenance.json").read_text())["files"])
+        assert os.listdir(old.parent) == ["e"]
+
+    @pytest.mark.parametrize(
+        "command", [["plot"], ["report"], ["compare", "--baseline", "PEM", "--out", "out/e/c.csv"]]
+    )
+    def test_a_file_is_listed_before_it_is_there(
+        self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch, command: list[str]
+    ) -> None:
+        """So that a process that is killed at any instant leaves none that outlives its results."""
+        assert call("run", "e.yaml").code == 0
+        folder, before = here / "out/e", set(belongings.names_in(here / "out/e"))
+        replace_ = os.replace
+
+        def watched(source: Any, target: Any) -> None:
+            assert Path(target).relative_to("out/e").as_posix() in belongings.made_in(folder)
+            replace_(source, target)
+
+        monkeypatch.setattr(os, "replace", watched)
+        assert call(command[0], "out/e", *command[1:]).code == 0
+        assert set(belongings.names_in(folder)) - before <= belongings.made_in(folder)
 
 
 class TestOneWriter:

@@ -11,7 +11,7 @@ from copem_replay.core.files import atomic_files
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.render import METADATA, rendered
 from copem_replay.report.figures.selection import Selection, choose
-from copem_replay.results.belongings import check_still
+from copem_replay.results.belongings import check_still, list_made
 
 if TYPE_CHECKING:
     from copem_replay.results.read import Results
@@ -46,4 +46,5 @@ def write_figures(results: Results, folder: Path | None, selection: Selection) -
                 (scratch / f"{name}{suffix}").write_bytes(data)
                 files.append(f"{name}{suffix}")
         check_still(results.folder, results.seen)
+        list_made(results.folder, [folder / file for file in files])
     return [folder / file for file in files], notes

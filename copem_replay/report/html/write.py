@@ -6,7 +6,7 @@ from pathlib import Path
 
 from copem_replay.core.errors import OutputError
 from copem_replay.core.files import atomic_file
-from copem_replay.results.belongings import check_still
+from copem_replay.results.belongings import check_still, list_made
 
 REPORT = "report.html"
 _SUFFIXES = (".html", ".htm")
@@ -35,4 +35,5 @@ def write_report(folder: Path, out: Path | None = None, *, baseline: str | None 
     with atomic_file(path) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
         check_still(folder, study.results.seen)
+        list_made(folder, [path])
     return path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from copem_replay.core.files import atomic_file
 from copem_replay.core.text import wrapped
 from copem_replay.metrics.fixed import NOTHING_DRAWN
 from copem_replay.metrics.summary_text import as_text
+from copem_replay.results.belongings import list_made
 from copem_replay.results.compare.limits import ALL_ALIKE
 from copem_replay.results.compare.metrics import METRICS
 
@@ -53,8 +54,11 @@ def check_out(path: Path) -> None:
         raise OutputError(f"{path}: expected another name, found that of a table of the results in that folder")
 
 
-def write_comparison(comparison: Comparison, path: Path) -> None:
-    """Write CSV (a row per log, configuration and metric) or a Markdown table, as the name says. Raises OutputError."""
+def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path] = ()) -> None:
+    """Write CSV (a row per log, configuration and metric) or a Markdown table, as the name says. Raises OutputError.
+
+    `folders`: of the results that are compared.
+    """
     from copem_replay.results.write import write_csv
 
     check_out(path)
@@ -63,6 +67,8 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
             write_csv(comparison.table, scratch)
         else:
             scratch.write_text(comparison_markdown(comparison), encoding="utf-8")
+        for folder in folders:
+            list_made(folder, [path])
 
 
 def _cells(comparison: Comparison) -> pd.DataFrame:
