@@ -18,8 +18,9 @@ from urllib.parse import unquote, urlsplit
 from copem_replay.core.errors import CopemError, InputError
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
-_STAMPS = ("ETag", "etag", "md5Hash", "Last-Modified", "LastModified", "last_modified", "mtime", "updated", "created")
-"""Under one of these a file system says what changes with a file's content."""
+_STAMPS = ("ETag", "etag", "md5Hash", "Last-Modified", "LastModified", "last_modified", "updated", "created")
+"""Under one of these a file system says what changes with a file's content. Not `mtime`: whoever writes a file there
+(`rsync -t`) says of what time it is."""
 
 
 @dataclass(frozen=True, repr=False)

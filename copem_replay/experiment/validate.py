@@ -31,7 +31,7 @@ from copem_replay.experiment.file import (
 )
 from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.experiment.shape_problems import by_key
-from copem_replay.io.checksum import sha256_of
+from copem_replay.io.checksum import check_unchanged, sha256_of
 from copem_replay.io.config import ReadFields
 from copem_replay.io.open import name_of
 from copem_replay.io.recorded_output import recorded_output
@@ -117,7 +117,7 @@ class Survey(Protocol):
         """The recording as it is known from before; None: it has to be read."""
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
-        """What stays in memory of a recording."""
+        """What stays in memory of a recording. Raises RecordingError where its files are no longer what was read."""
 
 
 def read_logs(
@@ -146,7 +146,7 @@ def read_logs(
             if recording is None:
                 recording, wrong = _read(alone, path)
                 if recording is not None and not wrong and survey is not None:
-                    recording = survey.kept(recording, alone, again)
+                    recording, wrong = _kept(survey, recording, alone, again)
             refused += [log.within(entry, settings) for log in wrong]
             if recording is not None and not wrong:
                 named = names_of.get(place, [])
@@ -155,6 +155,19 @@ def read_logs(
     # Named when it is known which there are: the experiment that is written with the results names only these.
     given = {place: settings.name for place, (_, settings) in mine.items() if settings.name is not None}
     return _with_names(recordings, given), refused
+
+
+def _kept(
+    survey: Survey, recording: Recording, experiment: Experiment, again: Callable[[], Recording]
+) -> tuple[Recording | None, list[Refused]]:
+    """What stays in memory of a recording, or why it cannot be replayed: its files are others by now."""
+    try:
+        return survey.kept(recording, experiment, again), []
+    except RecordingError as error:
+        path = first_of(recording.place)
+        return None, [
+            Refused(path, line) for line in (error.problems if isinstance(path, Remote) else error.within(path))
+        ]
 
 
 def gone(place: Place, key: Key | None) -> Refused | None:
@@ -222,11 +235,15 @@ def _read(experiment: Experiment, place: Place) -> tuple[Recording | None, list[
         return _read_here(experiment, place)
     if (place.there or {}).get("type") == "directory":
         return None, [Refused(place, "expected a file, found a folder; a rosbag2 folder is read on this machine only")]
+    now = Remote(place.url)  # what is known of it is found by what is said of it just before it is copied
     try:
+        stamp = now.stamp
         with at_hand(place) as here:
             recording, wrong = _read_here(experiment, here)
             if recording is not None:
-                recording = replace(recording, remote=place, sha256=sha256_of(here))
+                recording = replace(recording, remote=now, sha256=sha256_of(here), stamps=None)
+        if Remote(place.url).stamp != stamp:
+            return None, [Refused(place, "it changed while it was copied; run the command again")]
     except InputError as error:
         return None, [Refused(place, line.removeprefix(f"{place}: ")) for line in error.problems]
     return recording, [replace(one, path=place, reason=one.reason.replace(str(here), str(place))) for one in wrong]
@@ -274,6 +291,10 @@ def _read_here(experiment: Experiment, place: Local) -> tuple[Recording | None, 
         except RecordingError as error:
             at = ("configurations", name, "recorded")
             wrong += [Refused(path, line, at) for line in error.within(path)]
+    try:
+        check_unchanged(recording.stamps or ())
+    except RecordingError as error:
+        return None, [Refused(path, line) for line in error.within(path)]
     recording = replace(recording, lists=lists, notes=tuple(notes))
     return recording, wrong + [
         Refused(path, reason, key) for key, reason in against_log(experiment, recording, known=bool(wrong))

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,7 @@ from copem_replay.core.remote import Remote
 from copem_replay.core.text import counted
 from copem_replay.core.tracks import CLASSES, Float, Scene, Tracks
 from copem_replay.io.channel import Channel
+from copem_replay.io.checksum import Stamps, check_unchanged, stamps_of
 from copem_replay.io.ground_truth import assemble
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.open import open_log, together_of
@@ -66,7 +69,8 @@ class Recording:
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
     together: Together | None = None  # the recordings of the drive, `path` being the first; None: it is one
     remote: Remote | None = None  # where it lies, if not on this machine: `path` was a copy
-    sha256: str | None = None  # of that copy
+    sha256: str | None = None  # of what was read, where it is known already
+    stamps: Stamps | None = None  # of its files on this machine before they were read; None: a copy, or not known
     survey: Survey | None = None  # where it was not read, but is known from before: no truth, no lists (`survey.whole`)
 
     @property
@@ -92,7 +96,6 @@ class Recording:
         return (self.path,) if self.together is None else self.together.paths
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
 def read(
     source: Local | str | Log,
     *,
@@ -111,9 +114,34 @@ def read(
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
     on the topic of the truth was logged; None: from the beginning, to the end.
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
-    or several; EmptyWindowError.
+    or several, a file that changes while it is read; EmptyWindowError.
     """
-    log = source if isinstance(source, Log) else open_log(Path(source) if isinstance(source, str) else source)
+    how = partial(_read, name=name, ego=ego, topic=topic, fields=fields, beside=beside, window_s=window_s)
+    if isinstance(source, Log):
+        return how(source)
+    at, stamps = Path(source) if isinstance(source, str) else source, None
+    with suppress(RecordingError):  # which is said when it is opened
+        stamps = stamps_of(at)
+    try:
+        recording = how(open_log(at))
+    except RecordingError:
+        check_unchanged(stamps or ())  # for this is why
+        raise
+    check_unchanged(stamps or ())
+    return replace(recording, stamps=stamps)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what is no number, or too large for one, is left out later, and said
+def _read(
+    log: Log,
+    *,
+    name: str,
+    ego: str | EgoTopic | None,
+    topic: str | None,
+    fields: Fields | None,
+    beside: Collection[str],
+    window_s: WindowSeconds,
+) -> Recording:
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import ExperimentError
@@ -39,8 +40,11 @@ class LogSurvey:
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
         """A recording that was read, in the experiment as it is for this log: in memory, or what is left of it there.
 
-        Raises ExperimentError.
+        Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.
         """
+        from copem_replay.pipeline.study_log import content_of
+
+        recording = replace(recording, sha256=content_of(recording))
         if not self._states or self._states + recording.object_states <= STATES_HELD:
             self._states += recording.object_states
             return recording

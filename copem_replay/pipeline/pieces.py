@@ -110,6 +110,10 @@ class Pieces:
         text = canonical(dict(said) | {"digest": key_of(canonical(said))})
         self.store.write(f"logs/{key_of(about)}.json", text.encode())
 
+    def forget(self, about: str) -> None:
+        """Know nothing of a log by this any more. Raises OutputError."""
+        self.store.write(f"logs/{key_of(about)}.json", b"")
+
 
 def name_of(recipe: str) -> str:
     """What the piece that is made by a recipe is called in a store."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +12,12 @@ from uuid import uuid4
 import numpy as np
 
 from copem_replay.core.components import Component
+from copem_replay.core.errors import RecordingError
 from copem_replay.core.remote import Remote
 from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.drive import for_all_logs, of_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.checksum import sha256_of
-from copem_replay.io.containers.rosbag2_metadata import files_of
+from copem_replay.io.checksum import Stamps, check_unchanged, sha256_of, stamps_of
 from copem_replay.io.recording import Recording
 from copem_replay.io.survey import Survey, whole
 from copem_replay.io.together import Place, Together, first_of
@@ -28,6 +27,7 @@ from copem_replay.pipeline.pieces import Pieces
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.recipe import canonical, digests, fingerprint, key_of, own_components
 
+Stamp = tuple[object, ...]
 _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
 
@@ -56,8 +56,24 @@ class StudyLog:
     def whole(self) -> Recording:
         """The recording with its truth and its lists."""
         if self._whole is None:
-            self._whole = whole(self.recording)
+            read = whole(self.recording)
+            self._check_same(read)
+            self._whole = read
         return self._whole
+
+    def _check_same(self, read: Recording) -> None:
+        """Raise RecordingError where what was read again is not what is known, which is forgotten then."""
+        survey = self.recording.survey
+        if survey is None or (found := content_of(read)) == self.digests["sha256"]:
+            return
+        if self.pieces is not None and survey.about:
+            self.pieces.forget(survey.about)
+        known = self.digests["sha256"]
+        raise RecordingError(
+            f"expected the content that it had when it was read before, SHA-256 {known[:12]}…, found {found[:12]}…; "
+            "run the command again, and it is replayed as it is now",
+            path=first_of(read.place),
+        )
 
     def drop(self) -> None:
         """Let go of what was read again: a log that stays in memory does, any other is read where it is needed."""
@@ -88,7 +104,9 @@ class StudyLog:
     def _found(self, alone: Experiment) -> Facts:
         if self.pieces is None:
             return Facts.of(self.whole(), self.replay(), alone)
-        about, survey = survey_key(self.recording.place, alone), self.recording.survey
+        one, survey = self.recording, self.recording.survey
+        seen = None if one.stamps is None else _named_by(one.stamps)
+        about = survey_key(one.place, alone, seen)
         said = survey.said if survey is not None and survey.about == about else self.pieces.known(about)
         if said is not None and said["scene"]["log"] == self.name:
             return Facts.read(said["facts"])
@@ -105,8 +123,16 @@ class StudyLog:
 
 def digests_of(recording: Recording) -> dict[str, str]:
     """SHA-256 of the content of a recording that was read, and of its truth."""
-    sha256 = recording.sha256 or sha256_of(recording.local)
-    return {"sha256": sha256, "truth": truth_digest(recording.scene, recording.truth)}
+    return {"sha256": content_of(recording), "truth": truth_digest(recording.scene, recording.truth)}
+
+
+def content_of(recording: Recording) -> str:
+    """SHA-256 of what was read. Raises RecordingError where the files have changed since, so that nothing tells it."""
+    if recording.sha256 is not None:
+        return recording.sha256
+    found = sha256_of(recording.local)
+    check_unchanged(recording.stamps or ())
+    return found
 
 
 def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
@@ -115,11 +141,16 @@ def dropped(recording: Recording, read: Callable[[], Recording]) -> Recording:
     return replace(recording, truth=_nothing(), lists={}, around=None, lane_boundaries=(), survey=survey)
 
 
-def survey_key(place: Place, experiment: Experiment) -> str:
-    """All that is known of a log depends on: its files as they are now, and the experiment, resolved for it."""
+def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | None = None) -> str:
+    """All that is known of a log depends on: its files as they were `seen`, and the experiment, resolved for it.
+
+    `seen`: None: as they are now.
+    """
     of_all, own = _of_every_log(experiment)
     ahead_ns = place.ahead_ns if isinstance(place, Together) else ()
-    return canonical({"files": stamps(place), "ahead_ns": ahead_ns, "of": of_all, "own": digests(own)})
+    return canonical(
+        {"files": stamps(place) if seen is None else seen, "ahead_ns": ahead_ns, "of": of_all, "own": digests(own)}
+    )
 
 
 @for_all_logs
@@ -129,20 +160,24 @@ def _of_every_log(experiment: Experiment) -> tuple[str, list[Component]]:
     return of_all, own_components(experiment)
 
 
-def stamps(place: Place) -> list[tuple[object, ...]]:
-    """Which files they are, their sizes, and what changes with their content."""
+def stamps(place: Place) -> list[Stamp]:
+    """Which files they are, their sizes, and what changes with their content. Raises RecordingError, InputError."""
     if isinstance(place, Remote):  # which is not asked for a content that it does not tell from another
         return [(str(place), *(place.stamp or (uuid4().hex,)))]
-    paths = place.paths if isinstance(place, Together) else (place,)
-    files = [file for path in paths for file in (files_of(path) if path.is_dir() else [path])]
-    stats = [(os.path.realpath(file), os.stat(file)) for file in files]
-    return [(file, stat.st_size, stat.st_mtime_ns) for file, stat in stats]
+    return _named_by(stamps_of(place))
+
+
+def _named_by(files: Stamps) -> list[Stamp]:
+    return [tuple(one[1:]) for one in files]  # whatever path led to them
 
 
 def known_log(pieces: Pieces, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
     """A recording as it is known from before, in an experiment that is resolved for it; None: it has to be read."""
-    said = pieces.known(about := survey_key(place, experiment))
-    if said is None:
+    try:
+        about = survey_key(place, experiment)
+    except RecordingError:  # which is said when it is read
+        return None
+    if (said := pieces.known(about)) is None:
         return None
     together, remote = place if isinstance(place, Together) else None, place if isinstance(place, Remote) else None
     first = first_of(place)

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from copem_replay.core.colours import configuration_colours
+from copem_replay.core.errors import RecordingError
+from copem_replay.io.checksum import check_unchanged, sha256_of, stamps_of
 from copem_replay.io.recording import Recording
-from copem_replay.io.together import at_hand
+from copem_replay.io.together import at_hand, first_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,7 +44,8 @@ class Exporter:
 
     `names`: of the files that come of a stem and so many configurations, where they may be several.
 
-    `write` raises OutputError where the file cannot be written, and RecordingError where the recording cannot be read.
+    `write` raises OutputError where the file cannot be written, and RecordingError where the recording cannot be read:
+    the results are then without it, and say so.
     """
 
     suffix: str
@@ -61,7 +64,11 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
 
     recording = run.recording
     with at_hand(recording.place) as here:
-        return write_mcap(
+        stamps = stamps_of(here)
+        known = recording.sha256 is not None or recording.stamps is not None
+        if known and stamps != recording.stamps and sha256_of(here) != recording.sha256:
+            raise RecordingError("it is no longer what was replayed", path=first_of(recording.place))
+        notes = write_mcap(
             path,
             here,
             run.one.replay.scene,
@@ -73,6 +80,8 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
             truth_scene(run.one, run.table),
             configuration_colours(run.every),
         )
+        check_unchanged(stamps)
+    return notes
 
 
 MCAP = Exporter(".mcap", _write_mcap)

@@ -20,7 +20,7 @@ import pytest
 from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
 from copem_replay.experiment.file import load, parse
-from copem_replay.pipeline import gather
+from copem_replay.pipeline import gather, study_log
 from copem_replay.results import place
 from copem_replay.results import write as results
 from copem_replay.results.compare import compare, comparison_markdown, comparison_text
@@ -1102,7 +1102,8 @@ class TestFailure:
 
     def test_a_log_that_vanishes(self, here: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
         """A recording that is gone when its checksum is taken: no results, and the reason in a line."""
-        monkeypatch.setattr(results, "write_csv", lambda *_: (here / "drive.mcap").unlink())
+        digest = study_log.sha256_of
+        monkeypatch.setattr(study_log, "sha256_of", lambda at: [at.unlink(), digest(at)][1])
         ended = call("run", "e.yaml")
         assert ended.code == 2
         assert len(ended.lines) == 1

@@ -176,6 +176,11 @@ def fitted(study: Study, unit: str, how: Any) -> FittedPem:
 
     if not study.recordings:
         raise ExperimentError(study.source.at(("logs",), "expected at least one recording, found none"))
+    from copem_replay.pipeline.study_log import content_of
+
+    # Taken now, while the files are what was read.
+    known = tuple(replace(recording, sha256=content_of(recording)) for recording in study.recordings)
+    study = replace(study, recordings=known)
     found = checked(fit_unit(study.experiment, study.recordings, unit, how))
     return FittedPem(study.experiment, study.recordings, found)
 

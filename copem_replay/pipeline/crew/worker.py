@@ -100,7 +100,7 @@ _kept: dict[tuple[LogTask, str], _Study] = {}
 
 def _opened(task: Task) -> _Study:
     log = task.log, ""
-    with suppress(OSError):  # that it cannot be read is said when it is
+    with suppress(CopemError):  # that it cannot be read is said when it is
         log = task.log, repr(stamps(task.log.place))
     with _lock:
         study = _kept.pop(log, None)
