@@ -2,8 +2,9 @@
 
 `surface`: uniform in azimuth over the target's angular extent; at each azimuth the share of the column of the
 target's nearest face, bottom to top, that no body in front of it covers. `flat`: the same with infinitely high
-bodies. A body whose footprint overlaps the target's does not hide it; a unit inside the target's footprint sees 1; a
-unit inside another body ignores that body; a unit's own carrier neither hides nor is seen.
+bodies. A box whose footprint overlaps the target's does not hide it; an obstacle hides wherever its face is nearer than
+the target's. A unit inside the target's footprint sees 1; a unit inside another body, between its bottom and its top,
+ignores that body; a unit's own carrier neither hides nor is seen.
 The integration is in perception/visibility_kernel.py.
 """
 

@@ -5,6 +5,12 @@ by) is linear in the ray's direction u, so the slope at which each body begins a
 Slopes are equal where a linear function of u vanishes: these azimuths are found in closed form and split the interval.
 What is left is a smooth ratio of two linear functions, integrated with three Gauss points.
 
+A box that overlaps the target does not hide it. A part of an obstacle may overlap it: it hides where its face is nearer
+than the target's, so the azimuths at which the two outlines cross split the interval, too.
+
+A unit over or under a body stands within its outline: the body is there at all azimuths, from straight down (up) to the
+slope of its far upper (lower) edge.
+
 All in one file, because Numba's cache on disk only notices changes in the file of the function it compiled.
 """
 
@@ -33,7 +39,8 @@ class Boxes(NamedTuple):
 class Statics(NamedTuple):
     """Static obstacles as convex parts: `xy_m (V, 2)` counter-clockwise, parts `start (G + 1,)`.
 
-    `body (G,)` says which obstacle a part belongs to; `bottom_m`, `top_m (G,)` are heights in the world.
+    `body (G,)` says which obstacle a part belongs to; `bottom_m`, `top_m (G,)` are heights in the world. What stands on
+    the ground begins 20 m below it.
     """
 
     xy_m: Float
@@ -78,10 +85,16 @@ BODY = np.dtype(
 """A body: how many corners it has; the obstacle it is a part of, −1: none; middle, radius and height. From one
 observer: bearing and distance of the middle, and the extent in azimuth about it."""
 
+_CORNERS = 4
+"""Of a target."""
 _OVERLAP_M = 1e-6
 """Footprints that enter each other by less than this only touch (chosen)."""
+_ON_TOP_M = 0.01
+"""A unit so little above a box touches it (chosen: heights in logs are rounded)."""
 _SURELY = 1e-6
 """By how much, in rad, m and of slopes, a body that hides all of another exceeds it (chosen: far above rounding)."""
+_STEEP = 1e6
+"""Slope, in heights of the target's face by its distance, that stands for straight down and straight up (chosen)."""
 _MAX_PIECES = 512
 """Azimuth pieces per view (chosen): 60 bodies in front of one target need about 250."""
 
@@ -108,7 +121,7 @@ def views(
         widest = max(widest, static_start[g + 1] - static_start[g])
     xy = np.empty((most, widest, 2))
     of = np.empty(most, BODY)
-    hides, inside = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
+    hides, inside, over = np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_), np.empty(most, dtype=np.bool_)
     near, alone = np.empty(most, dtype=np.int64), np.empty(1, dtype=np.int64)
     work = _workspace(most, widest)
 
@@ -142,18 +155,28 @@ def views(
                 continue
             ox, oy, oz = observer_m[u, f, 0], observer_m[u, f, 1], observer_m[u, f, 2]
             for b in range(bodies):
-                inside[b] = _contains(xy[b], of[b].size, ox, oy)
-                hides[b] = not inside[b] and not (b < n and object_ix[first + b] == carrier_ix[u])
+                # Who touches a box is in it: some logs hold the mast, too. Who touches an obstacle is in front of it:
+                # some cameras are fixed to walls, or stand on roofs.
                 dx, dy = of[b].x_m - ox, of[b].y_m - oy
                 of[b].bearing, of[b].distance_m = np.arctan2(dy, dx), np.sqrt(dx * dx + dy * dy)
+                inside[b] = of[b].distance_m <= of[b].radius_m + _SURELY and _contains(
+                    xy[b], of[b].size, ox, oy, 0.0 if b < n else _OVERLAP_M
+                )
+                apart = _ON_TOP_M if b < n else -_OVERLAP_M
+                over[b] = not flat and inside[b] and (oz > of[b].top_m + apart or oz < of[b].bottom_m - apart)
+                hides[b] = over[b] or not inside[b]
+                if b < n and object_ix[first + b] == carrier_ix[u]:
+                    hides[b] = False
                 of[b].lo = of[b].hi = 0.0
-                if hides[b]:
+                if over[b]:
+                    of[b].lo, of[b].hi = -np.pi, np.pi
+                elif hides[b]:
                     for k in range(of[b].size):
                         vx, vy = xy[b, k, 0] - ox, xy[b, k, 1] - oy
                         angle = np.arctan2(dx * vy - dy * vx, dx * vx + dy * vy)
                         of[b].lo, of[b].hi = min(of[b].lo, angle), max(of[b].hi, angle)
             for b in range(n, bodies):  # inside one part of an obstacle is inside the obstacle
-                if inside[b]:
+                if inside[b] and not over[b]:
                     for c in range(n, bodies):
                         if of[c].owner == of[b].owner:
                             hides[c] = False
@@ -176,7 +199,7 @@ def views(
                     ):
                         near[count] = b
                         count += 1
-                count = _drop_overlapping(t, near, count, xy, of)
+                count = _drop_overlapping_boxes(t, near, count, xy, of)
                 if count == 0:
                     out[u, first + t] = 1.0
                 elif _hidden_by_one(t, near, count, of, oz, flat):
@@ -221,11 +244,13 @@ def _hidden_by_one(t: int, near: Int, count: int, of: Any, oz: float, flat: bool
 
 
 @nb.njit(inline="always")
-def _contains(polygon: Float, size: int, px: float, py: float) -> bool:
+def _contains(polygon: Float, size: int, px: float, py: float, depth_m: float) -> bool:
+    # Whether a place is inside by so much.
     for k in range(size):
         m = k + 1 if k + 1 < size else 0
         ex, ey = polygon[m, 0] - polygon[k, 0], polygon[m, 1] - polygon[k, 1]
-        if ex * (py - polygon[k, 1]) - ey * (px - polygon[k, 0]) < 0.0:
+        least = depth_m * np.sqrt(ex * ex + ey * ey) if depth_m > 0.0 else 0.0
+        if ex * (py - polygon[k, 1]) - ey * (px - polygon[k, 0]) < least:
             return False
     return True
 
@@ -248,47 +273,33 @@ def _separated(a: Float, na: int, b: Float, nb_: int) -> bool:
 
 
 @nb.njit(cache=True, nogil=True)
-def _drop_overlapping(t: int, near: Int, count: int, xy: Float, of: Any) -> int:
-    # A body that overlaps the target's footprint does not hide it; one part that overlaps frees the whole obstacle.
+def _drop_overlapping_boxes(t: int, near: Int, count: int, xy: Float, of: Any) -> int:
+    # A box that overlaps the target's footprint does not hide it: a rider's overlaps that of the bicycle.
     kept = 0
-    freed = -1
     for i in range(count):
         b = near[i]
-        dx, dy, reach = of[b].x_m - of[t].x_m, of[b].y_m - of[t].y_m, of[b].radius_m + of[t].radius_m
-        overlaps = (
-            dx * dx + dy * dy < reach * reach
-            and not _separated(xy[t], of[t].size, xy[b], of[b].size)
-            and not _separated(xy[b], of[b].size, xy[t], of[t].size)
-        )
-        if not overlaps:
+        if (
+            of[b].owner >= 0
+            or not _may_meet(of, b, t)
+            or _separated(xy[t], of[t].size, xy[b], of[b].size)
+            or _separated(xy[b], of[b].size, xy[t], of[t].size)
+        ):
             near[kept] = b
             kept += 1
-        elif of[b].owner >= 0:
-            freed = of[b].owner
-            for j in range(i + 1, count):  # the parts still to come …
-                if of[near[j]].owner == freed:
-                    near[j] = t  # … marked: the target never hides itself
-            back = 0
-            for j in range(kept):  # … and those already kept
-                if of[near[j]].owner != freed:
-                    near[back] = near[j]
-                    back += 1
-            kept = back
-    if freed < 0:
-        return kept
-    final = 0
-    for j in range(kept):
-        if near[j] != t:
-            near[final] = near[j]
-            final += 1
-    return final
+    return kept
+
+
+@nb.njit(inline="always")
+def _may_meet(of: Any, a: int, b: int) -> bool:
+    dx, dy, reach = of[a].x_m - of[b].x_m, of[a].y_m - of[b].y_m, of[a].radius_m + of[b].radius_m
+    return bool(dx * dx + dy * dy < reach * reach)
 
 
 @nb.njit(cache=True, nogil=True)
 def _workspace(most: int, widest: int) -> Work:
     return (
         np.empty((most + 1, widest, 2)),  # corners in the frame of the view: observer at 0, target along +x
-        np.empty(most * widest + widest + 2),  # azimuths of corners
+        np.empty((1 + _CORNERS) * most * widest + widest + 2),  # azimuths of corners, and of edges that cross
         np.empty((most, 2)), np.empty((most, 2)),  # slopes at which each active body begins and ends to cover, as g·u
         np.empty(_MAX_PIECES),  # azimuths where two slopes are equal
         np.empty(most), np.empty(most),  # covered intervals of one column
@@ -333,6 +344,27 @@ def _insert(values: Float, count: int, value: float) -> int:
     return count + 1
 
 
+@nb.njit(cache=True, nogil=True)
+def _insert_crossings(a: Float, na: int, b: Float, nb_: int, lo: float, hi: float, breaks: Float, count: int) -> int:
+    # The azimuths between lo and hi at which an edge of a crosses one of b go to the ascending breaks[:count].
+    for k in range(na):
+        m = k + 1 if k + 1 < na else 0
+        ex, ey = a[m, 0] - a[k, 0], a[m, 1] - a[k, 1]
+        for j in range(nb_):
+            n = j + 1 if j + 1 < nb_ else 0
+            fx, fy = b[n, 0] - b[j, 0], b[n, 1] - b[j, 1]
+            across = ex * fy - ey * fx
+            if across == 0.0:
+                continue
+            dx, dy = b[j, 0] - a[k, 0], b[j, 1] - a[k, 1]
+            p, q = (dx * fy - dy * fx) / across, (dx * ey - dy * ex) / across  # parts of the edges up to there
+            if 0.0 <= p <= 1.0 and 0.0 <= q <= 1.0:
+                angle = np.arctan2(a[k, 1] + p * ey, a[k, 0] + p * ex)
+                if lo < angle < hi:
+                    count = _insert(breaks, count, angle)
+    return count
+
+
 @nb.njit(inline="always")
 def _equal_at(
     gx: float, gy: float, a: float, b: float, cos_a: float, sin_a: float, cos_b: float, sin_b: float
@@ -366,6 +398,9 @@ def _share(
             angle = np.arctan2(vy, vx)
             if lo < angle < hi:
                 n_breaks = _insert(breaks, n_breaks, angle)
+    for i in range(count):
+        if of[near[i]].owner >= 0 and _may_meet(of, near[i], t):
+            n_breaks = _insert_crossings(local[i], of[near[i]].size, local[count], of[t].size, lo, hi, breaks, n_breaks)
     z0, z1 = of[t].bottom_m - oz, of[t].top_m - oz
     seen = 0.0
     for piece in range(n_breaks - 1):
@@ -408,12 +443,24 @@ def _active(
         hit, enter, nx, ny, fx, fy = _faces(local[i], of[body].size, ux, uy)
         if not hit or enter >= face:
             continue
+        of_obstacle = of[body].owner >= 0
+        if of_obstacle and enter + _OVERLAP_M >= face:  # in line with the target's face: not before it
+            continue
         if flat:
             return -1
         bottom, top = of[body].bottom_m - oz, of[body].top_m - oz
+        if of_obstacle and fx * ux + fy * uy < tx * ux + ty * uy:  # what is beyond the target's face hides nothing
+            fx, fy = tx, ty
         # It begins to cover at its lower edge: the near one where that is below the eyes, else the far one.
         bx, by = (bottom * nx, bottom * ny) if bottom < 0.0 else (bottom * fx, bottom * fy)
         ex, ey = (top * nx, top * ny) if top > 0.0 else (top * fx, top * fy)
+        if enter <= 0.0:  # the unit is within its outline
+            if top <= _OVERLAP_M:
+                bx, by = -_STEEP * tx, -_STEEP * ty
+            elif bottom >= -_OVERLAP_M:
+                ex, ey = _STEEP * tx, _STEEP * ty
+            else:  # it leans on its face
+                return -1
         below = (bx - tx0) * cos_a + (by - ty0) * sin_a <= 0 and (bx - tx0) * cos_b + (by - ty0) * sin_b <= 0
         above = (ex - tx1) * cos_a + (ey - ty1) * sin_a >= 0 and (ex - tx1) * cos_b + (ey - ty1) * sin_b >= 0
         if below and above:

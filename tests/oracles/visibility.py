@@ -2,8 +2,9 @@
 
 Contract, to the letter.  `surface`: seen from the unit, uniform in azimuth over the target's angular extent;
 at each azimuth the share of the column of the target's nearest face, bottom to top, that no body in front of
-it covers.  A body whose footprint overlaps the target's does not hide it; a unit inside the target's
-footprint sees 1; a unit inside another body ignores that body.  `flat`: the same with infinitely high bodies.
+it covers.  A box whose footprint overlaps the target's does not hide it; a solid hides along every ray on which
+it begins before the target does.  A unit inside the target's footprint sees 1; a unit inside another body,
+between its bottom and its top, ignores that body.  `flat`: the same with infinitely high bodies.
 
 Bodies are upright prisms: a simple footprint polygon, (K, 2) metres in either turning sense and not closed,
 with a bottom and a top.  `flat_share` asks Shapely, `surface_share` intersects rays with edges in numpy, so
@@ -45,9 +46,9 @@ def _overlaps(a: shapely.Polygon, b: shapely.Polygon) -> bool:
     return bool(shapely.intersection(a, b).area > OVERLAP_M2)
 
 
-def _can_hide(observer: shapely.Point, target: shapely.Polygon, other: shapely.Polygon) -> bool:
+def _can_hide(observer: shapely.Point, target: shapely.Polygon, other: shapely.Polygon, solid: bool = False) -> bool:
     # `contains` is strict: a unit leaning against a wall from outside still has the wall in front of it.
-    return not _overlaps(target, other) and not other.contains(observer)
+    return (solid or not _overlaps(target, other)) and not other.contains(observer)
 
 
 def _relative_azimuths(observer_xy: Array, points: Array, bearing: float) -> Array:
@@ -74,13 +75,16 @@ def _angular_extent(observer_xy: Array, target: Array) -> tuple[float, float, fl
 
 
 def flat_share(
-    observer_xy: npt.ArrayLike, target_polygon: npt.ArrayLike, other_polygons: Sequence[npt.ArrayLike]
+    observer_xy: npt.ArrayLike,
+    target_polygon: npt.ArrayLike,
+    other_polygons: Sequence[npt.ArrayLike],
+    solids: Sequence[npt.ArrayLike] = (),
 ) -> float:
     """Visible share with infinitely high bodies; exact but for rounding (about 1e-9).
 
-    Whether a body is in front of the target changes only at the azimuth of a vertex: bodies that overlap
-    the target are out, so no edge crosses an edge of the target.  Between two neighbouring vertices one ray
-    speaks for all of them.
+    Whether a body is in front of the target changes only at the azimuth of a vertex, or of a place where the
+    outline of a solid meets that of the target: boxes that overlap the target are out.  Between two neighbouring
+    ones of these one ray speaks for all of them.
     """
     here = np.asarray(observer_xy, dtype=float)[:2]
     target = np.asarray(target_polygon, dtype=float)
@@ -89,9 +93,12 @@ def flat_share(
         return 1.0
     shapes = [shapely.Polygon(np.asarray(other, dtype=float)) for other in other_polygons]
     shapes = [shape for shape in shapes if _can_hide(point, target_shape, shape)]
+    solid_shapes = [shapely.Polygon(np.asarray(solid, dtype=float)) for solid in solids]
+    shapes += [shape for shape in solid_shapes if _can_hide(point, target_shape, shape, solid=True)]
 
     bearing, first, last = _angular_extent(here, target)
-    vertices = np.vstack([target, *(shapely.get_coordinates(shape) for shape in shapes)])
+    meetings = [target_shape.boundary.intersection(shape.boundary) for shape in shapes]
+    vertices = np.vstack([target, *(shapely.get_coordinates(shape) for shape in [*shapes, *meetings])])
     azimuths = _relative_azimuths(here, vertices, bearing)
     cuts = np.unique(np.clip(azimuths, first, last))
     reach = 1.0 + 2.0 * float(np.linalg.norm(target - here, axis=1).max())
@@ -132,7 +139,8 @@ def _chords(here: Array, directions: Array, polygon: Array) -> tuple[Array, Arra
     if distance.shape[1] % 2:
         distance = distance[:, :-1]  # the crossings are even in number: the last of an odd row is infinite
     near, far = distance[:, 0::2], distance[:, 1::2]
-    # The observer is outside: a chord lies wholly ahead or wholly behind, up to rounding on the boundary.
+    # A chord lies wholly ahead or wholly behind, up to rounding on the boundary, or goes through the observer, who
+    # is above or below the body: it begins at once.
     ahead = far > SAME_PLACE_M
     return np.where(ahead, np.maximum(near, SAME_PLACE_M), np.inf), np.where(ahead, far, np.inf)
 
@@ -149,7 +157,13 @@ def _covered_length(low: Array, high: Array) -> Array:
     return total
 
 
-def surface_share(observer_xyz: npt.ArrayLike, target: Prism, others: Sequence[Prism], azimuths: int = 2000) -> float:
+def surface_share(
+    observer_xyz: npt.ArrayLike,
+    target: Prism,
+    others: Sequence[Prism],
+    azimuths: int = 2000,
+    solids: Sequence[Prism] = (),
+) -> float:
     """Visible share with the heights of the bodies, by dense sampling of the azimuth.
 
     Each column is exact, so the only error is that of the azimuth: each silhouette edge is misplaced by half
@@ -173,9 +187,12 @@ def surface_share(observer_xyz: npt.ArrayLike, target: Prism, others: Sequence[P
     assert np.isfinite(to_target).all(), "every azimuth within the extent meets the target"
 
     lows, highs = [np.zeros((azimuths, 1))], [np.zeros((azimuths, 1))]  # an empty interval: nothing hides
-    for polygon, body_bottom, body_top in others:
+    for k, (polygon, body_bottom, body_top) in enumerate([*others, *solids]):
         polygon = np.asarray(polygon, dtype=float)
-        if not _can_hide(point, target_shape, shapely.Polygon(polygon)):
+        shape, solid = shapely.Polygon(polygon), k >= len(others)
+        if not solid and _overlaps(target_shape, shape):
+            continue
+        if shape.contains(point) and body_bottom <= eye <= body_top:
             continue
         near, far = _chords(here, directions, polygon)
         in_front = near < to_target - SAME_PLACE_M

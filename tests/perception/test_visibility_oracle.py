@@ -115,6 +115,32 @@ def test_a_target_one_stands_in_the_notch_of_is_refused():
         surface_share(EYE, (AHEAD, 1.0, 1.0), [])
 
 
+def test_a_solid_hides_on_every_ray_on_which_it_begins_first():
+    # It reaches .01 m into the target, along the whole of its face; of the upper half of the face; of none of it.
+    def seen(solid: Array) -> float:
+        flat = flat_share((0.0, 0.0), AHEAD, [], [solid])
+        assert surface_share(EYE, TARGET, [], solids=[(solid, -HIGH, HIGH)]) == pytest.approx(flat, abs=1e-3)
+        return flat
+
+    assert seen(span(5.0, 10.01, -5.0, 5.0)) == 0.0
+    assert seen(span(5.0, 10.01, 0.0, 5.0)) == pytest.approx(0.5, abs=1e-9)
+    assert seen(span(10.01, 13.0, -5.0, 5.0)) == 1.0
+    # The face of this one runs from (9.5, −1) to (10.5, 1): it crosses that of the target at (10, 0).
+    assert seen(np.array([[9.5, -1.0], [20.0, -1.0], [20.0, 1.0], [10.5, 1.0]])) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_body_under_the_eye_hides_what_is_below_its_far_edge():
+    # From 6 m over a roof of 4 m that ends at 6 m: 6 − 2·10/6 = 2.667 m is the lowest one sees; at 5.5 m 2.364 m.
+    roof = span(-6.0, 6.0, -9.0, 9.0)
+    tall: Prism = (AHEAD, 0.0, 4.0)
+    for given in ({"others": [(roof, 0.0, 4.0)]}, {"others": [], "solids": [(roof, 0.0, 4.0)]}):
+        assert surface_share((0.0, 0.0, 6.0), tall, **given) == pytest.approx((4 - (6 - 20 / 6)) / 4, abs=1e-3)
+        assert surface_share((0.0, 0.0, 3.9), tall, **given) == 1.0  # inside it: ignored
+    # From 1 m under a deck of 2 m that ends at 5 m: 1 + 1·10/5 = 3 m is the highest one sees.
+    deck = (span(-5.0, 5.0, -9.0, 9.0), 2.0, 3.0)
+    assert surface_share((0.0, 0.0, 1.0), tall, [deck]) == pytest.approx(0.75, abs=1e-3)
+
+
 # --------------------------------------------------------------------------------- with heights
 
 
