@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +64,27 @@ def class_indices(names: tuple[str, ...]) -> NDArray[np.int8]:
     return np.array(sorted(CLASSES.index(m) for m in members), dtype=np.int8)
 
 
+class Solid(NamedTuple):
+    """An upright prism that hides what is behind it, for the whole of a log. It is no object: no unit lists it."""
+
+    name: str  # as notes say it
+    corners_m: tuple[tuple[float, float], ...]  # K places around a simple polygon
+    bottom_m: float  # above z = 0
+    height_m: float
+    on_ground: bool = False  # its bottom is the ground, as far as that is known
+
+    @property
+    def top_m(self) -> float:
+        """Above z = 0."""
+        return self.bottom_m + self.height_m
+
+
 @dataclass(frozen=True)
 class Scene:
-    """The constants of one log: its objects, their classes, its start and end, its ego.
+    """The constants of one log: its objects, their classes, its start and end, its ego, and what else hides them.
 
     `moving` is False for stationary objects (they hide others; they are measured only when named).
+    `solids` are stationary objects with an outline of their own: they hide, and are no objects.
     `ego_ix` is −1 where the log has no ego vehicle, or none was chosen.
 
     >>> scene = cr.read_recording("logs/tc016d.mcap").scene
@@ -84,6 +100,7 @@ class Scene:
     moving: Bool  # (N,)
     ego_ix: int = -1
     ego_sized: bool = True  # False: the size of the ego is not known, nor are gaps to it
+    solids: tuple[Solid, ...] = ()
 
     @cached_property
     def object_number(self) -> dict[str, int]:

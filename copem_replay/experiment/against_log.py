@@ -10,6 +10,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording, moving_ids
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
+from copem_replay.perception.sensor_poses import solid_around
 
 
 def against_log(experiment: Experiment, recording: Recording, *, known: bool = False) -> Iterator[tuple[Key, str]]:
@@ -43,6 +44,7 @@ def against_log(experiment: Experiment, recording: Recording, *, known: bool = F
                 yield ("units", f"{name}:{taken[0]}"), f"this is the name of {name} on object {taken[0]}"
         elif unit.on is not None and unit.on not in scene.object_number:
             yield ("units", name, "on"), f"no object {unit.on!r} in the log; there are {moving_ids(scene)}"
+    yield from _inside_solids(experiment, recording)
     onset = experiment.measure.onset
     if onset.requires is not Requires.UNIT_ON_EGO or known:
         return
@@ -52,6 +54,18 @@ def against_log(experiment: Experiment, recording: Recording, *, known: bool = F
         on_ego = ("ego", scene.object_ids[scene.ego_ix])
         if not any(unit.on in on_ego for unit in experiment.units.values()):
             yield ("measure", "onset"), f"{onset.kind} needs a unit on the ego; or use line_of_sight_any"
+
+
+def _inside_solids(experiment: Experiment, recording: Recording) -> Iterator[tuple[Key, str]]:
+    for name, unit in experiment.units.items():
+        found = solid_around(recording.scene, recording.truth, unit, experiment.obstacles)
+        if found is not None:
+            solid, depth_m = found
+            yield (
+                ("units", name, "at"),
+                f"{name} stands {depth_m:.2g} m inside {solid.name} (z {solid.bottom_m:.4g} … {solid.top_m:.4g} m): it "
+                "would look through it; expected a place beside it, or `height_m` above its top",
+            )
 
 
 def _host(recording: Recording) -> str:

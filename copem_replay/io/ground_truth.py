@@ -5,11 +5,13 @@ Everything left out or put right is said in a line with its count.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, VALUES, Bool, Float, Int, Scene, Solid, Tracks
 from copem_replay.io import plausibility as repair
 from copem_replay.io.schemas.decoded import FARTHEST_M, DecodedObjects
 
@@ -44,7 +46,14 @@ def assemble(
         moving=columns.moving[first_seen],
     )
     tracks = _tracks(scene, stamp_ns, frame[row], object_ix, columns.values[row], notes)
-    return scene, tracks, tuple(notes)
+    return replace(scene, solids=_stood(columns.solids, columns.values[row, _Z], tracks.z_m)), tracks, tuple(notes)
+
+
+def _stood(solids: tuple[Solid, ...], said_z_m: Float, z_m: Float) -> tuple[Solid, ...]:
+    """The solids, those that are centred on z = 0 stood on it where the boxes were."""
+    if said_z_m.any() or not z_m.any():
+        return solids
+    return tuple(one._replace(bottom_m=0.0) if 2 * one.bottom_m == -one.height_m else one for one in solids)
 
 
 def _in_order(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int]:

@@ -11,7 +11,7 @@ from copem_replay.core.tracks import VALUES, Scene, Tracks
 
 
 def truth_digest(scene: Scene, truth: Tracks) -> str:
-    """SHA-256 of the truth: objects by id, their classes and states to the last bit, the ego, the span of time.
+    """SHA-256 of the truth: objects by id, their classes and states to the last bit, the ego, the span of time, solids.
 
     Nothing of it depends on the file, the topic, or the order in which the recording has its objects.
     """
@@ -27,4 +27,6 @@ def truth_digest(scene: Scene, truth: Tracks) -> str:
         digest.update(truth.stamp_ns[truth.frame_ix[rows]].astype("<i8").tobytes())
         for name in VALUES:
             digest.update((np.asarray(getattr(truth, name)[0, rows], dtype="<f8") + 0.0).tobytes())  # no −0
+    if scene.solids:
+        digest.update(json.dumps(sorted(scene.solids)).encode())
     return digest.hexdigest()

@@ -134,7 +134,7 @@ def _best_share(
     }
     if not chosen:
         return np.zeros(len(truth.frame_ix))
-    places = [poses(scene, u, truth, unit_ground(truth, n, u, [])) for n, u in chosen.items()]
+    places = [poses(scene, u, truth, unit_ground(truth, n, u)) for n, u in chosen.items()]
     shares = visible_shares(
         truth,
         static,

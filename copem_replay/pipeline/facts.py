@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from copem_replay.core.time_chunk import WHOLE
-from copem_replay.core.tracks import Scene
+from copem_replay.core.tracks import Scene, Solid
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.output_times import OutputTimes
@@ -81,5 +81,8 @@ def scene_of(said: dict[str, Any]) -> Scene:
             "object_ids": tuple(said["object_ids"]),
             "object_class": np.array(said["object_class"], dtype=np.int8),
             "moving": np.array(said["moving"], dtype=bool),
+            "solids": tuple(
+                Solid(name, tuple((x, y) for x, y in corners), *rest) for name, corners, *rest in said["solids"]
+            ),
         }
     )

@@ -109,13 +109,13 @@ def _unit(one: OneRun, name: str, pose: Pose, *, field: bool = True) -> Entity:
 
 def _statics(one: OneRun) -> Iterator[Entity]:
     """Obstacles: the outlines of their convex parts, at the bottom and at the top."""
-    static = one.replay.placed.static
+    static, solids = one.replay.placed.static, one.replay.placed.solids
     for part in range(len(static.body)):
         corners = static.xy_m[static.start[part] : static.start[part + 1]].tolist()
         around = [*corners, *corners[:1]]
-        heights = float(static.bottom_m[part]), float(static.top_m[part])
-        lines = [Line([(x, y, z) for x, y in around], STATIC) for z in heights]
-        yield Entity(f"obstacle {static.body[part]}:{part}", {"obstacle": str(static.body[part])}, lines)
+        solid = solids[static.body[part]]
+        lines = [Line([(x, y, z) for x, y in around], STATIC) for z in (solid.bottom_m, solid.top_m)]
+        yield Entity(f"{solid.name}:{part}", {"obstacle": solid.name.split()[-1]}, lines)
 
 
 def _at(truth: Tracks, row: int) -> Pose:

@@ -10,7 +10,7 @@ import numpy as np
 from copem_replay.core.colours import TRUTH, Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks
-from copem_replay.perception.visibility import Statics
+from copem_replay.perception.sensor_poses import SensorPoses
 from copem_replay.viewer.palette import EGO, GRID, LANE, STANDING
 from copem_replay.viewer.sink import Out, f32, object_labels, slices, upright
 
@@ -104,10 +104,14 @@ def grid(out: Out, truth: Tracks) -> None:
     )
 
 
-def statics(out: Out, static: Statics) -> None:
-    """Obstacles as prisms: a wall per edge, each with its own corners so that it is shaded flat, and a lid."""
+def solids(out: Out, placed: SensorPoses) -> None:
+    """Obstacles as prisms: a wall per edge, each with its own corners so that it is shaded flat, and a lid.
+
+    Those that hide from below the ground are drawn from the ground.
+    """
     import rerun as rr
 
+    static = placed.static
     if not len(static.body):
         return
     sizes = np.diff(static.start)
@@ -115,7 +119,8 @@ def statics(out: Out, static: Statics) -> None:
     there = here + 1
     there[static.start[1:] - 1] = static.start[:-1]
     a, b = static.xy_m[here], static.xy_m[there]
-    bottom, top = static.bottom_m[part], static.top_m[part]
+    bottom = np.array([solid.bottom_m for solid in placed.solids])[static.body][part]
+    top = static.top_m[part]
     corners = [f32(*a.T, bottom), f32(*b.T, bottom), f32(*b.T, top), f32(*a.T, top)]
     outward = f32((b - a)[:, 1], -(b - a)[:, 0], np.zeros(len(a)))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)

@@ -107,7 +107,7 @@ def _text(ids: Sequence[str], units: Sequence[str], seen: Sight, of: Status, m: 
     body = seen.body_ix[unit, np.maximum(of.frame[rows], 0), m] if span.status == HIDDEN else np.zeros_like(unit)
     pairs, count = np.unique(np.stack([unit, body]), axis=1, return_counts=True)
     by, what = pairs[:, count.argmax()].tolist()
-    return lane_text(span.status, units[by], body_name(ids, what))
+    return lane_text(span.status, units[by], body_name(ids, seen.solids, what))
 
 
 def _with_onset(

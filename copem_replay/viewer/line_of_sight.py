@@ -9,7 +9,7 @@ import numpy as np
 
 from copem_replay.core.interpolation import AROUND_S, at_instants, wrap
 from copem_replay.core.own_code import is_own
-from copem_replay.core.tracks import Bool, Float, Int, Tracks
+from copem_replay.core.tracks import Bool, Float, Int, Solid, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.observation import Observations
@@ -29,7 +29,7 @@ class Sight:
     """At frames of the truth (K,), of objects (M,), from the experiment's units (U,), those that are modelled.
 
     `share`: NaN outside the unit's field of view, where it is absent, or carried by the object. `body_ix`: of what is
-    not clearly seen the object that hides most of it, −1 − k: the obstacle k; `body_m` where that is.
+    not clearly seen the object that hides most of it, −1 − k: the solid k; `body_m` where that is.
     """
 
     elapsed_ns: Int
@@ -38,6 +38,7 @@ class Sight:
     in_range: Bool  # (U, K, M)
     body_ix: Int  # (U, K, M)
     body_m: Float  # (U, K, M, 3)
+    solids: tuple[str, ...]  # their names
     place_m: Float  # (U, K, 3) of the unit
 
 
@@ -56,14 +57,15 @@ def sight(replay: Replay, experiment: Experiment, shown: Sequence[int], found: O
         in_range=np.zeros(shape, dtype=bool),
         body_ix=np.zeros(shape, dtype=np.int64),
         body_m=np.full((*shape, 3), np.nan),
+        solids=tuple(solid.name for solid in replay.placed.solids),
         place_m=np.full((*shape[:2], 3), np.nan),
     )
-    obstacles = _obstacle_centres(replay, experiment)
+    centres = _centres(replay.placed.solids)
     known = _known_shares(seen, experiment, found, scene.t0_ns)
     # So many frames at once as have the rows of a time chunk: what hides an object is searched among all that is there.
     at_once = max(1, ROWS_A_CHUNK * len(truth.stamp_ns) // max(len(truth.frame_ix), 1))
     for first in range(0, len(stamps), at_once):
-        _look_at(replay, experiment, seen, known, slice(first, first + at_once), obstacles)
+        _look_at(replay, experiment, seen, known, slice(first, first + at_once), centres)
     return seen
 
 
@@ -85,7 +87,7 @@ def _known_shares(seen: Sight, experiment: Experiment, found: Observations | Non
 
 
 def _look_at(
-    replay: Replay, experiment: Experiment, seen: Sight, known: Float, part: slice, obstacles: np.ndarray
+    replay: Replay, experiment: Experiment, seen: Sight, known: Float, part: slice, centres: np.ndarray
 ) -> None:
     """From all units at some of the frames. Out: their part of `seen`."""
     scene, shown = replay.scene, seen.object_ix.tolist()
@@ -105,14 +107,14 @@ def _look_at(
         seen.place_m[u, part] = np.stack([at.x_m, at.y_m, at.z_m], axis=-1)
         seen.in_range[u, frame, column] = _anywhere(pem, view, "range_m")
         seen.share[u, frame, column] = np.where(in_field, share, np.nan)
-        _hidden(replay, experiment, unit, at, seen, u, part, obstacles)
+        _hidden(replay, experiment, unit, at, seen, u, part, centres)
 
 
 def _poses(replay: Replay, name: str, unit: Unit, world: Tracks) -> UnitPoses:
     """Where the unit is at the frames of the world; of a fixed one that has lists that is known."""
     placed, count = replay.placed.poses[name], len(world.stamp_ns)
     if unit.at is None or not len(placed.x_m):
-        return poses(replay.scene, unit, world, unit_ground(replay.truth, name, unit, []))
+        return poses(replay.scene, unit, world, unit_ground(replay.truth, name, unit))
     fixed = placed.x_m, placed.y_m, placed.z_m, placed.heading_rad, placed.ground_m
     x, y, z, heading, ground = (np.full(count, of[0]) for of in fixed)
     return UnitPoses(x, y, z, heading, np.ones(count, dtype=bool), ground)
@@ -175,7 +177,7 @@ def _rows(world: Tracks, shown: Sequence[int]) -> tuple[Int, Int]:
 
 def _hidden(
     replay: Replay, experiment: Experiment, unit: Unit, at: UnitPoses, seen: Sight, u: int, part: slice,
-    obstacles: np.ndarray,
+    centres: np.ndarray,
 ) -> None:  # fmt: skip
     """What hides objects from unit u, only at the frames at which it does. Out: `body_ix` and `body_m` of `seen`.
 
@@ -197,8 +199,8 @@ def _hidden(
     rows, column = rows[kept], column[kept]
     count = len(world.frame_ix)
     body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
-    bodies = np.concatenate([world.row_object_ix, -1 - np.arange(len(obstacles))])
-    where = np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), obstacles])
+    bodies = np.concatenate([world.row_object_ix, -1 - np.arange(len(centres))])
+    where = np.concatenate([f32(world.x_m[0], world.y_m[0], world.z_m[0]), centres])
     seen.body_ix[u, frames[world.frame_ix[rows]], column] = bodies[body]
     seen.body_m[u, frames[world.frame_ix[rows]], column] = where[body]
 
@@ -227,13 +229,10 @@ def _anywhere(pem: tuple[Couple, ...], view: ViewGeometry, *keys: str) -> Bool:
     return held & ~np.isnan(view.range_m)
 
 
-def _obstacle_centres(replay: Replay, experiment: Experiment) -> np.ndarray:
-    """(K, 3) of the experiment's own obstacles, halfway up."""
+def _centres(solids: Sequence[Solid]) -> np.ndarray:
+    """(K, 3) halfway up."""
     import shapely
 
-    static = replay.placed.static
-    if not experiment.obstacles:
-        return np.empty((0, 3), dtype=np.float32)
-    middle = shapely.centroid([shapely.Polygon(o.polygon_m) for o in experiment.obstacles])
-    _, part = np.unique(static.body, return_index=True)
-    return f32(shapely.get_x(middle), shapely.get_y(middle), (static.bottom_m + static.top_m)[part] / 2)
+    middle = shapely.centroid([shapely.Polygon(solid.corners_m) for solid in solids])
+    halfway_m = np.array([(solid.bottom_m + solid.top_m) / 2 for solid in solids])
+    return f32(shapely.get_x(middle), shapely.get_y(middle), halfway_m)

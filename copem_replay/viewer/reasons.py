@@ -63,16 +63,18 @@ def reasons(
     columns = np.stack([column, status, unit, *whole, body, near, started], axis=-1)
     keys, which = _distinct(columns)
     ids, units = short_ids(scene), [*experiment.units, TRUTH]  # −1: the truth, or no unit
-    asked = [(ids[seen.object_ix[key[0]]], units[key[2]], body_name(ids, key[5]), key) for key in keys.tolist()]
+    asked = [
+        (ids[seen.object_ix[key[0]]], units[key[2]], body_name(ids, seen.solids, key[5]), key) for key in keys.tolist()
+    ]
     taken = pa.array(which)
     labels = [_label(name, unit, what, key) for name, unit, what, key in asked]
     sentences = [_sentence(name, unit, what, key) for name, unit, what, key in asked]
     return Reasons(pa.array(labels, pa.string()).take(taken), pa.array(sentences, pa.string()).take(taken), which)
 
 
-def body_name(ids: Sequence[str], body: int) -> str:
-    """What hides an object: an object by its index, or −1 − k: the obstacle k."""
-    return ids[body] if body >= 0 else f"obstacle {-1 - body}"
+def body_name(ids: Sequence[str], solids: Sequence[str], body: int) -> str:
+    """What hides an object: an object by its index, or −1 − k: the solid k."""
+    return ids[body] if body >= 0 else solids[-1 - body]
 
 
 def _distinct(columns: Int) -> tuple[Int, Int]:

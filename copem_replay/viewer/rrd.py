@@ -191,7 +191,7 @@ def _begin(
     legend.bars(out, file.colours)
     text_panels.onsets(out, scene, of.table)
     boxes.grid(out, replay.truth)
-    boxes.statics(out, replay.placed.static)
+    boxes.solids(out, replay.placed)
     boxes.lane_boundaries(out, replay.lane_boundaries)
     sensors.units(out, replay, experiment)
     event_markers.onsets(out, replay, experiment, of.table, of.objects)

@@ -98,7 +98,7 @@ def _recorded_place(replay: Replay, experiment: Experiment, unit: Unit, time_s: 
     """(K, 3) where a unit is whose lists are recorded: on its carrier, or at its place, if it is given."""
     place = np.full((len(time_s), 3), np.nan)
     if unit.at is not None:
-        ground_m = unit_ground(replay.truth, "", unit, [])
+        ground_m = unit_ground(replay.truth, "", unit)
         place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))
     elif unit.on is not None:
         on = np.full(len(time_s), carrier(replay.scene, unit))

@@ -207,6 +207,41 @@ class TestOneLog:
         assert len(found) == 2
         assert found[1] == f"12: units.mast.on: drive.mcap: no object '9' in the log; there are {CARS}"
 
+    HOUSE = "obstacles: [{{polygon_m: [[11.8, -9], [30, -9], [30, 9], [11.8, 9]], height_m: {height_m}}}]"
+
+    @pytest.mark.parametrize(
+        ("height_m", "place", "found"),
+        [
+            (12, "at: [12.0, -4.5], height_m: 5.0", "0.2 m inside obstacle 0 (z 0 … 12 m)"),
+            (5.1, "at: [12.0, -4.5], height_m: 5.0", "0.2 m inside obstacle 0 (z 0 … 5.1 m)"),
+            (12, "at: [11.0, 0.0], offset_m: [3.0, 0.0], height_m: 0.5", "2.2 m inside obstacle 0 (z 0 … 12 m)"),
+            (12, "at: [20.0, 0.0], height_m: 2.0, ground_z_m: -15.0", "8.2 m inside obstacle 0 (z 0 … 12 m)"),
+            (5, "at: [12.0, -4.5], height_m: 5.0", None),  # on its roof
+            (4.9, "at: [12.0, -4.5], height_m: 5.0", None),
+            (12, "at: [11.8, -4.5], height_m: 5.0", None),  # on its wall
+            (12, "at: [11.6, -4.5], height_m: 5.0", None),
+        ],
+    )
+    def test_a_unit_in_a_solid(self, tmp_path: Path, height_m: float, place: str, found: str | None) -> None:
+        drive(tmp_path / "drive.mcap")
+        text = changed(f"  mast: {{{place}, pem: onboard}}", self.HOUSE.format(height_m=height_m))
+        said = (
+            f"12: units.mast.at: drive.mcap: mast stands {found}: it would look through it; expected a place beside "
+            "it, or `height_m` above its top"
+        )
+        assert against_logs(tmp_path, text) == ([said] if found else [])
+
+    def test_a_unit_in_a_solid_of_the_log(self, tmp_path: Path) -> None:
+        """It is 1 m from two faces of a triangle; (17, 0.5), in the other half of its box, is in the open."""
+        corners = [(-1, -1), (9, -1), (-1, 9)]
+        house = Obj(id=9, x=12, y=-4.5, z=4, length=20, width=20, height=8, stationary=True, polygon=corners)
+        write_recording(tmp_path / "drive.mcap", [(0.1 * k, [Obj(id=1), house]) for k in range(3)], host=1)
+        assert against_logs(tmp_path, TEXT) == [
+            "12: units.mast.at: drive.mcap: mast stands 1 m inside object 9 (z 0 … 8 m): it would look through it; "
+            "expected a place beside it, or `height_m` above its top"
+        ]
+        assert against_logs(tmp_path, changed("  mast: {at: [17.0, 0.5], height_m: 5.0, pem: onboard}")) == []
+
     @pytest.mark.parametrize("ego", ["9", "3", "''"])
     def test_ego_that_is_not_in_it_or_does_not_move(self, tmp_path: Path, ego: str) -> None:
         drive(tmp_path / "drive.mcap")

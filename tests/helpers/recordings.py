@@ -38,6 +38,7 @@ class Obj:
     type: int = VEHICLE
     vehicle: int | None = CAR  # None: no classification
     stationary: bool = False
+    polygon: Sequence[tuple[float, float]] = ()  # corners of the base polygon
 
 
 def pedestrian(id: int, x: float, y: float = 0.0, **more: Any) -> Obj:
@@ -84,6 +85,8 @@ def _fill(message: Any, obj: Obj) -> None:
     base.dimension.length, base.dimension.width = obj.length, obj.width
     if obj.height is not None:
         base.dimension.height = obj.height
+    for x, y in obj.polygon:
+        base.base_polygon.add(x=x, y=y)
     if obj.yaw is not None:
         base.orientation.yaw = obj.yaw
     if obj.stationary:

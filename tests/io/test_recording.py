@@ -1,5 +1,6 @@
 """Reading recordings: each thing real ones get wrong, as one tiny log; and the real ones themselves."""
 
+import json
 import math
 from collections import Counter
 from pathlib import Path
@@ -13,6 +14,7 @@ from osi3.osi_sensorview_pb2 import SensorView
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES
 from copem_replay.io.recording import Recording, read
+from copem_replay.pipeline.facts import scene_as_json, scene_of
 from tests.helpers.recordings import (
     ANIMAL,
     PEDESTRIAN,
@@ -398,6 +400,56 @@ def test_stationary_objects(path):
     }
     assert not recording.truth.vx_mps.any()
     assert recording.notes == ()
+
+
+HOUSE = {"id": 9, "x": 15, "y": 10, "z": 5, "length": 20, "width": 20, "height": 8, "stationary": True}
+TRIANGLE = [(-10, -10), (10, 10), (-10, 10)]
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_stationary_object_with_a_base_polygon_is_a_solid_of_that_outline(path, closed):
+    """A triangle, half of its box, turned by 90°: (x, y) of its own is (15 − y, 10 + x) of the world."""
+    house = Obj(**HOUSE, yaw=math.pi / 2, polygon=TRIANGLE + TRIANGLE[: int(closed)])
+    write_recording(path, [(0, [Obj(id=1), house]), (0.1, [Obj(id=1), house])])
+    recording = read(path, name="log")
+    assert recording.scene.object_ids == ("1",)
+    [solid] = recording.scene.solids
+    assert (solid.name, solid.bottom_m, solid.top_m) == ("object 9", 1.0, 9.0)
+    assert np.array(solid.corners_m) == pytest.approx(np.array([(25, 0), (5, 20), (5, 0)]))
+    assert recording.notes == ("1 stationary object with a base_polygon: hides as that prism, and is no object",)
+    assert scene_of(json.loads(json.dumps(scene_as_json(recording.scene)))).solids == recording.scene.solids
+
+
+@pytest.mark.parametrize(
+    "polygon",
+    [
+        TRIANGLE[:2],
+        [(-10, -10), (10, 10), (10, -10), (-10, 10)],  # crosses itself
+        [(0, 0), (1, 1), (2, 2)],
+        [(0, 0), (math.nan, 1), (2, 0)],
+        [(0, 0), (1e300, 1), (2, 0)],
+        [(10 * math.cos(k), 10 * math.sin(k)) for k in np.arange(1001) * 2 * math.pi / 1001],
+    ],
+)
+def test_a_base_polygon_that_is_none_leaves_the_box(path, polygon):
+    write_recording(path, [(0, [Obj(id=1), Obj(**HOUSE, polygon=polygon)])] * 2)
+    recording = read(path, name="log")
+    assert (recording.scene.object_ids, recording.scene.solids) == (("1", "9"), ())
+    assert recording.notes[0] == "1 stationary object whose base_polygon is no simple polygon: its box taken"
+
+
+def test_a_solid_without_a_height_or_a_place_is_the_box_that_is_said_to_be_wrong(path):
+    flat, nowhere = Obj(**HOUSE | {"height": None}, polygon=TRIANGLE), Obj(**HOUSE | {"id": 8, "x": None})
+    write_recording(path, [(0, [Obj(id=1), flat, nowhere])])
+    recording = read(path, name="log")
+    assert (recording.scene.object_ids, recording.scene.solids) == (("1", "9"), ())
+
+
+def test_solids_on_z_0_are_stood_on_it_as_boxes_are(path):
+    write_recording(path, [(0, [Obj(id=1, z=0), pedestrian(2, 9, z=0), Obj(**HOUSE | {"z": 0}, polygon=TRIANGLE)])])
+    recording = read(path, name="log")
+    assert "every box is centred on z = 0: stood on z = 0" in recording.notes
+    assert [(solid.bottom_m, solid.top_m) for solid in recording.scene.solids] == [(0.0, 8.0)]
 
 
 def test_a_stationary_object_whose_id_moves_only_later_keeps_one_name(path):

@@ -79,7 +79,7 @@ BOTH = [f"drive: unit ego: {UNMET}", f"drive: unit mast: {UNMET}"]
          ["drive: unit mast: its place [12, 5000] is 4.97 km away from all objects, which are within x 0 … 70 m, "
           "y 0 … 30 m", f"drive: unit mast: {UNMET}"]),
         (MAST.format(at="[500000.0, 0.0]", yaw=0),
-         ["drive: unit mast: no object within 50 m, ground taken as z = 0 (give ground_z_m)",
+         ["drive: unit mast: ground taken from the nearest object, 499930 m away (give ground_z_m)",
           "drive: unit mast: its place [500000, 0] is 500 km away from all objects, which are within x 0 … 70 m, "
           "y 0 … 30 m", f"drive: unit mast: {UNMET}"]),
         (MAST.format(at="[1900.0, 0.0]", yaw=0).replace("pem:", "ground_z_m: 0, rate_hz: 5, pem:"),
@@ -89,6 +89,25 @@ BOTH = [f"drive: unit ego: {UNMET}", f"drive: unit mast: {UNMET}"]
 def test_check_says_it_as_run_does(here: Path, change: str, said: list[str]) -> None:
     assert before(here, changed(change)) == said
     assert after(here, changed(change)) == said
+
+
+HOUSES = """obstacles:
+- {polygon_m: [[38, -3], [48, -3], [48, 3], [38, 3]], height_m: 9}
+- {polygon_m: [[-9, 29], [9, 40], [-9, 40]], height_m: 9}"""
+
+
+def test_objects_in_obstacles_are_said_in_one_note(here: Path) -> None:
+    """The other car comes from x = 70 to 40 m in 3 s: its centre is in the first from 47 m on, 8 frames of .1 s.
+
+    The parked car, at (0, 30), is not in the second, a triangle, but in the box around it, all along.
+    """
+    said = ["drive: obstacle 0: object 2 is inside it for 0.8 s: hidden there"]
+    assert before(here, changed(HOUSES)) == said == after(here, changed(HOUSES))
+    both = HOUSES.replace("[9, 40]", "[9, 29], [9, 40]")
+    said = [f"{said[0]}; obstacle 1: object 3 is inside it for 3.1 s: hidden there"]
+    assert before(here, changed(both)) == said == after(here, changed(both))
+    low = HOUSES.replace("height_m: 9", "height_m: 0.7")
+    assert before(here, changed(low)) == [], "a car's centre, at .75 m, is above it"
 
 
 def test_what_is_said_of_many_logs_is_one_line(here: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from copem_replay.core.errors import InputError
+from copem_replay.core.tracks import Solid
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import read_logs
 from copem_replay.io.truth_digest import truth_digest
@@ -47,6 +48,10 @@ class TestDigest:
             self.digest((ego, replace(other, name="c"))), self.digest((ego, replace(other, moving=False))),
             self.digest((ego, replace(other, there=lambda t: t < 1))),
         ]  # fmt: skip
+        log = recording(self.THINGS, until_s=2.0)
+        for height_m in (3.0, 4.0):
+            solid = Solid("object 9", ((9.0, 9.0), (12.0, 9.0), (9.0, 12.0)), 0.0, height_m)
+            found.append(truth_digest(replace(log.scene, solids=(solid,)), log.truth))
         assert len(set(found)) == len(found)
 
 

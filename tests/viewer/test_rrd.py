@@ -256,6 +256,15 @@ def test_obstacles_are_prisms(tmp_path: Path) -> None:
     assert area[~lid].sum() >= (6 + 4 + 3 + 2 + 3 + 2) * 4 + (4 + 3 + 5) * 2 - 1e-4
 
 
+def test_what_hides_from_below_the_ground_is_drawn_from_the_ground(tmp_path: Path) -> None:
+    made = make(
+        tmp_path / "x.rrd", approaching(), obstacles=[{"polygon_m": [[0, 20], [4, 20], [4, 23]], "height_m": 2}]
+    )
+    assert made.replay.placed.static.bottom_m.tolist() == [-20.0]
+    place = np.array(static(made.path, "/world/static/obstacles")["Mesh3D:vertex_positions"])
+    assert set(place[..., 2].ravel()) == {0.0, 2.0}
+
+
 # ------------------------------------------------------------------------------- plots, words
 
 

@@ -5,6 +5,7 @@ Mostly an ego that stands at the origin and looks east, and pedestrians who are 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from copem_replay.core.colours import configuration_colours
+from copem_replay.core.tracks import Solid
 from copem_replay.viewer.selection import in_parts
 from copem_replay.viewer.sink import slices
 from copem_replay.viewer.statuses import STATUSES
@@ -64,6 +66,19 @@ def hiding(tmp_path_factory: pytest.TempPathFactory) -> Made:
         pems={"sure": [seen], "all": [seen]}, units={"pole": POLE, "ego": EGO_UNIT},
         configurations=EGO_ONLY | {"both": {"units": "all"}},
     )  # fmt: skip
+
+
+def test_a_solid_of_the_log_is_told_by_its_name(tmp_path: Path) -> None:
+    """It is beside an obstacle that hides nothing: each has its own name."""
+    scene = recording([Thing("ego", "car", standing(0, 0)), Thing("4", "pedestrian", standing(30, 0))], until_s=0.5)
+    corners = ((10.0, -10.0), (12.0, 0.0), (10.0, 10.0))
+    scene = replace(scene, scene=replace(scene.scene, solids=(Solid("object 9", corners, 0.0, 40.0),)))
+    away = WALL | {"polygon_m": [[-90, 5], [-80, 5], [-80, 9]]}
+    seen = [{"detection": {"kind": "visible_share"}}]
+    made = make(tmp_path / "x.rrd", scene, obstacles=[away], measure=PERSON, pems={"sure": seen})
+    assert told(made.path, "PEM", 0.2) == ["4 hidden from ego by object 9 (share 0.00)"]
+    assert labels(made.path, "PEM", 0.2) == ["4 behind object 9"]
+    assert lane(made.path, "4 pedestrian", 1) == [(0, "behind object 9 (from ego)")]
 
 
 def test_who_is_hidden_and_by_whom(hiding: Made) -> None:

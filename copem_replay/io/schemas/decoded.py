@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.tracks import Bool, Float, Int, Solid
 
 FARTHEST_M = 1e7
 """A coordinate beyond is no position (chosen; UTM northings end at 1e7)."""
@@ -38,5 +38,6 @@ class DecodedObjects:
     class_ix: NDArray[np.int8]  # (P,) index into CLASSES
     values: Float  # (P, len(VALUES))
     lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, in the truth's frame of reference: for showing only
+    solids: tuple[Solid, ...] = ()  # in that frame, too
     hosts: tuple[str, ...] = ()  # the host vehicle's id, once per message that says one
     notes: tuple[str, ...] = ()  # a line per kind of thing that was skipped or filled in

@@ -7,6 +7,8 @@ over these releases; a number that is not known reads as 0, unknown (the enums a
 
 from __future__ import annotations
 
+import itertools
+import math
 from array import array
 from collections import Counter
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from copem_replay.core.text import counted
-from copem_replay.core.tracks import CLASSES, VALUES, Float
+from copem_replay.core.tracks import CLASSES, VALUES, Float, Solid
 from copem_replay.io.schemas.decoded import FARTHEST_M, DecodedObjects
 
 GROUND_TRUTH = "osi3.GroundTruth"
@@ -56,6 +58,7 @@ _NAME_OF_VEHICLE = {
 }
 _CLASS_OF_VEHICLE = {number: CLASSES.index(name) for number, name in _NAME_OF_VEHICLE.items()}
 
+_MOST_CORNERS = 1000  # of a base polygon (chosen: visibility looks at each of them)
 _LAST_SECOND = 4_000_000_000  # chosen: Unix time of 2096; differences of stamps still fit 64 bits
 _NAN = float("nan")
 
@@ -86,6 +89,7 @@ class Decoder:
         self._class_ix = array("b")
         self._values = array("d")
         self._lane_boundaries: list[Float] = []
+        self._solids: dict[int, Solid | None] = {}  # of stationary objects by OSI id; None: a box
         self._notes: Counter[tuple[str, str]] = Counter()  # what is counted, and what is the matter with it
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
@@ -125,6 +129,9 @@ class Decoder:
     def columns(self) -> DecodedObjects:
         """All that was added."""
         ids, moving = self._names()
+        solids = tuple(solid for solid in self._solids.values() if solid is not None)
+        if solids:
+            self._notes["stationary object", "with a base_polygon: hides as that prism, and is no object"] = len(solids)
         return DecodedObjects(
             stamp_ns=np.array(self._stamp_ns, dtype=np.int64),
             stamped=np.array(self._stamped, dtype=bool),
@@ -135,6 +142,7 @@ class Decoder:
             class_ix=np.array(self._class_ix, dtype=np.int8),
             values=np.array(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
             lane_boundaries=tuple(self._lane_boundaries),
+            solids=solids,
             hosts=tuple(self._hosts),
             notes=tuple(f"{counted(number, noun)} {what}" for (noun, what), number in self._notes.items()),
         )
@@ -177,7 +185,7 @@ class Decoder:
             add_values((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
 
     def _add_stationary(self, objects: Any) -> None:
-        """One row each, of class `other`, at rest."""
+        """One row each, of class `other`, at rest; none for those that have an outline of their own."""
         number_of, notes = self._stationary_number, self._notes
         for stationary in objects:
             ident = stationary.id.value
@@ -185,6 +193,10 @@ class Decoder:
                 notes["object state", "without an id: skipped"] += 1
                 continue
             base = stationary.base
+            if ident not in self._solids:
+                self._solids[ident] = self._solid(ident, base)
+            if self._solids[ident] is not None:
+                continue
             position, size, yaw = base.position, base.dimension, base.orientation.yaw
             x, y = position.x, position.y
             if x == 0.0 and y == 0.0 and not base.HasField("position"):
@@ -195,6 +207,27 @@ class Decoder:
             self._object_ix.append(self._next_number(number_of, ident) if number is None else number)
             self._class_ix.append(OTHER)
             self._values.extend((x, y, position.z, yaw, 0.0, 0.0, size.length, size.width, size.height))
+
+    def _solid(self, ident: int, base: Any) -> Solid | None:
+        """The prism of an object over its base polygon, as high as its box; None where that is none: the box."""
+        if not base.base_polygon:
+            return None
+        import shapely
+
+        position, height_m, yaw = base.position, base.dimension.height, base.orientation.yaw
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        corners = tuple(
+            (position.x + cos * p.x - sin * p.y, position.y + sin * p.x + cos * p.y) for p in base.base_polygon
+        )
+        corners = corners[:-1] if corners[0] == corners[-1] else corners
+        somewhere = all(abs(value) <= FARTHEST_M for value in (*itertools.chain(*corners), position.z))
+        outline = shapely.Polygon(corners) if somewhere and 3 <= len(corners) <= _MOST_CORNERS else None
+        if outline is None or not outline.is_valid or not outline.area > 0.0:
+            self._notes["stationary object", "whose base_polygon is no simple polygon: its box taken"] += 1
+            return None
+        if not 0.0 < height_m <= FARTHEST_M:  # said of the box
+            return None
+        return Solid(f"object {ident}", corners, position.z - height_m / 2, height_m)
 
     def _add_lanes(self, boundaries: Any) -> None:
         """Lines of two points and more, of points that are somewhere."""

@@ -18,7 +18,15 @@ from copem_replay.io.recorded_osi import RecordedLists
 from copem_replay.io.recorded_units import as_recorded
 from copem_replay.io.recording import Recording
 from copem_replay.perception.observation import from_unit
-from copem_replay.perception.sensor_poses import UnitPoses, carrier, observers, place_obstacles, poses, unit_ground
+from copem_replay.perception.sensor_poses import (
+    UnitPoses,
+    carrier,
+    observers,
+    poses,
+    solids_of,
+    statics_of,
+    unit_ground,
+)
 from copem_replay.perception.visibility import visible_shares
 
 
@@ -88,13 +96,12 @@ def log_view(recording: Recording, found: RecordedLists, experiment: Experiment,
     stamps, of_frame = np.unique(found.tracks.stamp_ns, return_inverse=True)
     world = at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=alone.max_gap_s)
     mine = carrier(scene, unit)
-    notes: list[str] = []
     host = world.take_tracks(world.object_ix == mine)
-    at = poses(scene, unit, host, unit_ground(truth, name, unit, notes))
+    at = poses(scene, unit, host, unit_ground(truth, name, unit))
     at = replace(at, present=at.present & (stamps >= scene.t0_ns) & (stamps <= scene.end_ns))
     shares = visible_shares(
         world,
-        static=place_obstacles(truth, alone.obstacles, notes),
+        static=statics_of(solids_of(scene, truth, alone.obstacles)),
         observers=observers([at], np.array([mine])),
         model=alone.visibility,
     )[0]
