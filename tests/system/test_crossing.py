@@ -22,6 +22,7 @@ from osi3.osi_object_pb2 import MovingObject
 from ruamel.yaml import YAML
 from shapely import LineString, Polygon, affinity
 
+import copem_replay as cr
 from copem_replay.experiment.file import load, log_paths
 from copem_replay.experiment.validate import across_logs, problems, read_logs
 from copem_replay.io.write.osi_trace import write_osi_trace
@@ -367,6 +368,30 @@ def test_masts_carry_the_roadside_units_and_vehicles_the_others(
 
 def test_one_house_is_not_convex(houses: list[Polygon]) -> None:
     assert [house.convex_hull.area > house.area + 100 for house in houses] == [False, True, False]
+
+
+def test_the_garden_wall_hides_one_pedestrian(scenes: list[Scene], furniture: Scene) -> None:
+    """In closed form: pedestrian 50 is known 4.77 s later by the ego alone, .07 s with the masts, nobody else."""
+    data = YAML(typ="safe").load((ROOT / "logs/crossing_wall.yaml").read_text(encoding="utf-8"))
+    wall = Polygon(data["obstacles"][-1]["polygon_m"])
+    touched = {k for scene in [*scenes, furniture] for k, state in scene.items() if state.footprint.intersects(wall)}
+    assert touched == set()
+    assert wall.bounds[0] - 6.2 == pytest.approx(4.1), "metres from the kerb"
+
+    def unknown_s(obstacles: list[Any]) -> dict[tuple[str, str], float]:
+        given = data | {"logs": [str(LOG)], "obstacles": obstacles, "measure": data["measure"] | {"accuracy": False}}
+        exact = cr.run(cr.load_experiment(given), [LOG], jobs=1).exact
+        found = {}
+        for key, rows in exact.groupby(["configuration", "object_id"]):
+            known = rows.dropna(subset=["detection_s"])
+            instants = [rows["onset_s"].iloc[0], *known["detection_s"], rows["ended_s"].iloc[0]]
+            left = [1, *(1 - known["incidence"])]
+            found[key] = sum(s * (b - a) for s, (a, b) in zip(left, pairwise(instants), strict=True))
+        return found
+
+    walled, free = unknown_s(data["obstacles"]), unknown_s(data["obstacles"][:-1])
+    later_s = {key: walled[key] - free[key] for key in free if walled[key] != free[key]}
+    assert later_s == pytest.approx({("onboard", "50"): 4.768, ("roadside", "50"): 0.068}, abs=1e-3)
 
 
 def test_everybody_within_50_m_of_the_ego_is_looked_at(table: pd.DataFrame, scenes: list[Scene]) -> None:
