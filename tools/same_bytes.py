@@ -3,7 +3,8 @@
 A case is an experiment and the commands it goes through: the samples of each checkout, and recordings in ../shared/data
 (left out where absent) by the experiment that `init` writes. All that the commands write and print has to be equal byte
 by byte, .rrd by content; what may differ is listed in first_difference.py (KNOWN). A line for each case says `same` or
-the first difference. The exit code is 1 where anything differs, 2 where nothing is compared.
+the first difference. The exit code is 1 where anything differs, 2 where nothing is compared or a checkout has changed
+meanwhile.
 
 `--cases`: only these; 'tc016d*' are all that begin so. `--all`: the slow ones, too. `--runs`: of each experiment [20].
 `--keep FOLDER`: what was written stays there, in CASE/before and CASE/after.
@@ -15,6 +16,7 @@ that compiles; medians, and after : before.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import shutil
 import subprocess
@@ -181,6 +183,11 @@ class Checkout:
         if not Path(found).is_relative_to(self.folder):
             raise SystemExit(f"{folder}: expected its own package to be imported, found {found}")
 
+    def digest(self) -> str:
+        """Of the package's files, as they are now."""
+        files = sorted(path for path in (self.folder / "copem_replay").rglob("*.py"))
+        return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
     def python(self, code: str) -> str:
         """What a line of Python prints."""
         command = [sys.executable, "-c", code]
@@ -249,7 +256,7 @@ def compared(case: Case, sides: Sequence[Checkout], runs: int, folder: Path) -> 
 def compare_all(cases: Sequence[Case], sides: Sequence[Checkout], runs: int, keep: Path | None) -> int:
     """A line for each, and counts; the exit code."""
     counts = dict.fromkeys(("same", "different", "left out"), 0)
-    began_s = time.perf_counter()
+    began_s, digests = time.perf_counter(), [side.digest() for side in sides]
     with tempfile.TemporaryDirectory() if keep is None else nullcontext(keep) as scratch:
         for case in cases:
             case_began_s, folder = time.perf_counter(), Path(scratch) / case.name.replace(":", "_")
@@ -265,6 +272,9 @@ def compare_all(cases: Sequence[Case], sides: Sequence[Checkout], runs: int, kee
                 shutil.rmtree(folder)
     told = ", ".join(f"{number} {what}" for what, number in counts.items())
     print(f"{told}; {time.perf_counter() - began_s:.0f} s")
+    if changed := [str(side.folder) for side, was in zip(sides, digests, strict=True) if side.digest() != was]:
+        print(f"changed meanwhile: {', '.join(changed)}; compare again")
+        return 2
     return 1 if counts["different"] else 0 if counts["same"] else 2
 
 

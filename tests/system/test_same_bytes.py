@@ -125,7 +125,8 @@ def test_a_layout_differs_by_what_its_views_hold(found) -> None:
 
 def test_what_is_known_to_differ_is_listed_by_file_and_key(found) -> None:
     assert found("b/provenance.json", said(copem_replay="1", seed=1), said(copem_replay="2", seed=1)) is None
-    took = "ready\nnote: accuracy took 93 % of the 16 s of this replay; `measure: {accuracy: false}` leaves it out\n"
+    took = "note: accuracy took 93 % of the 16 s of this replay; `measure: {accuracy: false}` leaves it out\n"
+    took = f"ready\nreplaying: 45 %, 2 minutes left\nreplaying: 412 of 5000 logs, 9 minutes left\n{took}"
     assert found("printed_0_run.txt", text(took), text("ready\n")) is None
     assert found("kept.pieces/x", text("1"), text("2")) is None
     assert found("provenance.yaml", text("copem_replay: 1"), text("copem_replay: 2")) is not None
@@ -197,6 +198,21 @@ def test_two_checkouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
     assert "before: `run e.yaml --runs 20 --jobs 4 --out out` ended with 2" in capsys.readouterr().out
     assert ended(monkeypatch, one, same, "--time", "tc016d") == 0
     assert "after : before " in capsys.readouterr().out
+
+
+def test_a_checkout_that_changes_meanwhile_is_no_comparison(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, whole = checkout(tmp_path / "one", 1), same_bytes.compared
+
+    def compared(*given: object) -> str | None:
+        (tmp_path / "one/copem_replay/new.py").touch()
+        (tmp_path / "one/copem_replay/__init__.py").write_text("1\n")
+        return whole(*given)
+
+    monkeypatch.setattr(same_bytes, "compared", compared)
+    assert ended(monkeypatch, one, one, "--cases", "tc016d") == 2
+    assert f"changed meanwhile: {one}, {one}; compare again" in capsys.readouterr().out
 
 
 def test_changes_are_merged_into_the_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
