@@ -18,11 +18,11 @@ from copem_replay.io.recording import read
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 
-import fuzz_containers  # noqa: E402
-import fuzz_read  # noqa: E402
-from fuzz_container import Message, Model, Piece, Raw, Sample, record, taken_apart  # noqa: E402
-from fuzz_mutate import bomb, varint  # noqa: E402
-from fuzz_samples import json_updates, markers, poses_and_lists, protobuf_updates  # noqa: E402
+import fuzz  # noqa: E402
+from fuzzing.containers import TARGETS, put  # noqa: E402
+from fuzzing.mcap_model import Message, Model, Piece, Raw, Sample, record, taken_apart  # noqa: E402
+from fuzzing.mutators import bomb, varint  # noqa: E402
+from fuzzing.samples import json_updates, markers, poses_and_lists, protobuf_updates  # noqa: E402
 
 OSI = taken_apart(ROOT / "logs/tc016d.mcap", 10)
 TOO_LARGE = "a chunk holds more than 256 MiB"
@@ -58,7 +58,7 @@ def line(path: Path) -> str:
 )
 def test_two_thousand_hostile_files_end_well():
     """Recordings of every format, hit in every way: each is read or refused, none for long or with much memory."""
-    found = fuzz_read.fuzz(2000, 6, most=12, own=True)
+    found = fuzz.fuzz(2000, 6, most=12, own=True)
     assert found["defects"] == []
     assert found["inputs"] == 2000
     assert found["outcomes"]["read"] > 500  # not all is refused: what was hit is also read
@@ -66,9 +66,15 @@ def test_two_thousand_hostile_files_end_well():
 
 
 def test_inputs_come_in_every_container(tmp_path):
-    made = [fuzz_containers.put([poses_and_lists(), OSI], f"1:{k}", tmp_path)[0] for k in range(60)]
+    made = [put([poses_and_lists(), OSI], f"1:{k}", tmp_path)[0] for k in range(60)]
     assert {p.suffix for p in made} == {".mcap", ".osi", ""}
     assert all(p.exists() for p in made)
+
+
+def test_inputs_of_one_target(tmp_path):
+    for target, suffix in zip(TARGETS, (".mcap", ".osi", ""), strict=True):
+        made = [put([poses_and_lists(), OSI], f"1:{k}", tmp_path, target)[0] for k in range(5)]
+        assert {p.suffix for p in made} == {suffix}
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])

@@ -195,9 +195,9 @@ def test_a_worker_of_the_page_is_a_process_of_one_thread_per_core(monkeypatch: p
 def test_benchmarks_of_the_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Each prints what the page says that it tells; of fewer rows, and without the time that commands take."""
     monkeypatch.syspath_prepend(ROOT / "tools")
-    bench, compare = (importlib.import_module(name) for name in ("bench", "bench_compare"))
+    bench, common, compare = (importlib.import_module(n) for n in ("bench", "benches.common", "benches.compare"))
     monkeypatch.setattr(compare, "RUNS", 5)
-    monkeypatch.setattr(bench, "_spent", lambda command: bench.Spent(1.0, 2.0, 3))
+    monkeypatch.setattr(common, "spent", lambda command: common.Spent(1.0, 2.0, 3))
     monkeypatch.setenv("COPEM_REPLAY_DATA", "nowhere")
     bench.main([command.split()[-1] for command in in_a_line("python tools/bench.py ")])
     printed = {key for line in capsys.readouterr().out.splitlines() for key in json.loads(line)}

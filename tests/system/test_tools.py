@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +23,11 @@ DATA = ROOT.parent / "shared" / "data"
 sys.path.insert(0, str(ROOT / "tools"))
 
 import bench  # noqa: E402
-import bench_fit  # noqa: E402
-import bench_fusion  # noqa: E402
-import bench_long  # noqa: E402
-import bench_memory  # noqa: E402
 import calibrate_tc016d  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
 import paper  # noqa: E402
+from benches import common, fit, fusion, long, memory, reading  # noqa: E402
 
 
 def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
@@ -45,19 +41,19 @@ def test_rank_correlation_and_area_under_the_curve_by_hand() -> None:
 
 def test_bench_of_memory_remembers_all_that_the_crossing_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, few in (("LISTS", 20), ("OBJECTS", 2), ("RUNS", 2)):
-        monkeypatch.setattr(bench_memory, name, few)
-    assert all(number > 0 for number in bench_memory.numbers().values())
+        monkeypatch.setattr(memory, name, few)
+    assert all(number > 0 for number in memory.numbers().values())
     plain, found = problems(load(ROOT / "logs/crossing.yaml"))
     assert plain is not None, found
-    lasting = bench_memory.remembering(plain)
+    lasting = memory.remembering(plain)
     assert all(pem.memory.keys() == {"detection", *(pem.asked() or ())} for pem in lasting.pems.values())
     assert lasting.configurations == plain.configurations
 
 
 def test_bench_of_fitting_finds_what_it_put_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """60 of its drives: all rungs, and the share .6 of what lasts."""
-    monkeypatch.setattr(bench_fit, "PASSES", 60)
-    fitted, checked = bench_fit.detection()
+    monkeypatch.setattr(fit, "PASSES", 60)
+    fitted, checked = fit.fit()
     assert (fitted["rows"], fitted["rungs"], checked["runs"]) == (6000, 4, 500)
     assert fitted["share"] == pytest.approx(0.6, abs=0.1)
 
@@ -112,7 +108,7 @@ def test_benchmarks_print_json_lines(
     name: str, keys: set[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """How fast does not matter here: each is called once."""
-    monkeypatch.setattr(bench, "best", lambda work, times=5: bench._seconds(work))
+    monkeypatch.setattr(common, "best", lambda work, times=5: common.timed(work).seconds)
     bench.main([name])
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     printed = {key for line in lines for key in line}
@@ -120,26 +116,33 @@ def test_benchmarks_print_json_lines(
     assert all(value > 0 for line in lines for value in line.values() if not isinstance(value, str))
 
 
+def test_a_benchmark_that_there_is_not() -> None:
+    with pytest.raises(SystemExit, match=r"^expected some of pieces, .*; found writting$"):
+        bench.main(["paper", "writting"])
+
+
 def test_the_benchmarks_plain_loop_reads_what_the_reader_reads(tmp_path: Path) -> None:
     """The ratio compares like with like: as many object states."""
     from copem_replay.io.recording import read
 
-    world = bench.boxes(5, 7)
-    bench._write_truth(tmp_path / "b.mcap", world)
+    world = common.boxes(5, 7)
+    common.write_truth(tmp_path / "b.mcap", world)
     recording = read(tmp_path / "b.mcap", name="b")
-    assert bench._plain_loop(tmp_path / "b.mcap") == len(recording.truth.frame_ix) == 35
+    assert reading.plain_loop(tmp_path / "b.mcap") == len(recording.truth.frame_ix) == 35
     assert recording.truth.x_m[0] == pytest.approx(world.x_m[0])
 
 
-def once(work: Callable[[], object], _times: int) -> float:
-    return bench._seconds(work)
+@pytest.fixture
+def once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How fast does not matter: each is called once."""
+    monkeypatch.setattr(common, "best", lambda work, _times: common.timed(work).seconds)
 
 
-def test_the_crossing_is_fused_by_each_configuration() -> None:
-    experiment, recordings = bench._loaded(ROOT / "logs/crossing.yaml")
+def test_the_crossing_is_fused_by_each_configuration(once: None) -> None:
+    experiment, recordings = common.loaded("crossing")
     some = {name: experiment.configurations[name] for name in ("ideal", "union", "tracker:replay:mixed")}
     short = experiment.model_copy(update={"runs": 2, "configurations": some})
-    lines = list(bench_fusion.crossing(once, short, recordings[0]))
+    lines = list(fusion.crossing(short, recordings[0]))
     assert [line["algorithm"] for line in lines] == list(some)
     for line in lines:
         assert line["fusion_lists_per_s"] * line["us_per_list"] == pytest.approx(1e6, rel=0.01)
@@ -148,7 +151,7 @@ def test_the_crossing_is_fused_by_each_configuration() -> None:
 
 def test_what_units_report_in_fusion_benchmarks() -> None:
     """The same as from its lists one by one; eight of ten objects are in each."""
-    told, truth = bench_fusion.scene(50, 4, 20)
+    told, truth = fusion.scene(50, 4, 20)
     lists = [told.lists.of(0, f) for f in range(80)]
     units = [told.units[u] for u in told.unit_ix]
     plain = inputs_of([lists], units, told.captured_s.tolist(), told.arrives_s.tolist())
@@ -160,23 +163,23 @@ def test_what_units_report_in_fusion_benchmarks() -> None:
     assert truth[0].max() < 10 * np.sqrt(50)
 
 
-def test_only_equal_results_are_raced(monkeypatch: pytest.MonkeyPatch) -> None:
-    (line,) = bench_fusion.gnn_vs_numpy(once, (5,))
+def test_only_equal_results_are_raced(once: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    (line,) = fusion.gnn_vs_numpy((5,))
     assert line["gnn_vs_numpy"] > 0
     assert 0 <= line["max_dx_m"] < 1e-9
-    plain = bench_fusion.gnn_oracle.fuse
-    monkeypatch.setattr(bench_fusion.gnn_oracle, "fuse", lambda told, gate: plain(told, gate=0.5))
+    plain = fusion.gnn_oracle.fuse
+    monkeypatch.setattr(fusion.gnn_oracle, "fuse", lambda told, gate: plain(told, gate=0.5))
     with pytest.raises(AssertionError):
-        list(bench_fusion.gnn_vs_numpy(once, (5,)))
+        list(fusion.gnn_vs_numpy((5,)))
 
 
-def test_stone_soup_is_a_peer_where_it_is_installed() -> None:
+def test_stone_soup_is_a_peer_where_it_is_installed(once: None) -> None:
     """GOSPA is equal; tracks are alike: about as many as objects, and near them."""
     pytest.importorskip("stonesoup")
-    (line,) = bench_fusion.gospa_vs_stonesoup(once, 5)
+    (line,) = fusion.gospa_vs_stonesoup(5)
     assert line["gospa_vs_stonesoup"] > 0
     assert line["max_difference_m"] < 1e-9
-    (line,) = bench_fusion.tracker_vs_stonesoup(once, 1, 3)
+    (line,) = fusion.tracker_vs_stonesoup(1, 3)
     assert line["tracker_vs_stonesoup"] > 0
     for who in ("", "stonesoup_"):
         assert 14 <= line[f"{who}tracks"] <= 20
@@ -189,8 +192,8 @@ def test_without_stone_soup_a_line_says_why(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "stonesoup", None)
     why = "stonesoup is not installed: pip install '.[bench]'"
-    assert list(bench_fusion.gospa_vs_stonesoup(once)) == [{"gospa_vs_stonesoup": None, "why": why}]
-    assert list(bench_fusion.tracker_vs_stonesoup(once)) == [{"tracker_vs_stonesoup": None, "why": why}]
+    assert list(fusion.gospa_vs_stonesoup()) == [{"gospa_vs_stonesoup": None, "why": why}]
+    assert list(fusion.tracker_vs_stonesoup()) == [{"tracker_vs_stonesoup": None, "why": why}]
 
 
 def test_paper_counts_and_what_stands_beside_them() -> None:
@@ -249,7 +252,7 @@ def test_the_table_is_the_papers() -> None:
 
 def test_a_long_recording_is_timed(tmp_path: Path) -> None:
     """Here it is short: what grows how is for the benchmark to say."""
-    short, longer, slope = bench_long.long(tmp_path, minutes=(0.05, 0.1), objects=8)
+    short, longer, slope = long.grown(tmp_path, minutes=(0.05, 0.1), objects=8)
     assert (short["object_states"], longer["object_states"]) == (240, 480)
     assert all(value > 0 for line in (short, longer, slope) for value in line.values())
     written = (tmp_path / "city.yaml").read_text()
@@ -258,7 +261,7 @@ def test_a_long_recording_is_timed(tmp_path: Path) -> None:
 
 
 def test_a_crowd_is_timed(tmp_path: Path) -> None:
-    bench._write_truth(tmp_path / "crowd.mcap", bench.boxes(5, 4))
-    line = bench_long.crowd(tmp_path, 5, 4)
+    common.write_truth(tmp_path / "crowd.mcap", common.boxes(5, 4))
+    line = long.crowded(tmp_path, 5, 4)
     assert line["crowd_views"] == 5 * 4 * 3
     assert all(value > 0 for value in line.values())

@@ -13,7 +13,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-DATA = Path(__file__).parents[2] / "shared/data"
+from benches import common
+
+DATA = common.ROOT.parent / "shared/data"
 DRIVES = ("av2_3b3570b4", "nuscenes_scene0061", "nuscenes_scene0916")
 NAMES, RUNS = 11, 1000
 EXPERIMENT = f"""\
@@ -29,20 +31,21 @@ measure: {{accuracy: ACCURACY}}
 """
 
 
-def crew(folder: Path) -> Iterator[dict[str, object]]:
+def crew() -> Iterator[common.Line]:
     """Eleven names of three recorded drives; seconds from reading to the tables, Dask's start-up apart."""
     data = Path(os.environ.get("COPEM_REPLAY_DATA", DATA))
     if any(not (data / f"{name}.mcap").exists() for name in DRIVES):
         yield {"crew": f"skipped: no recorded drives ({', '.join(DRIVES)}) in {data}"}
         return
-    for k in range(NAMES):
-        shutil.copy(data / f"{DRIVES[k % len(DRIVES)]}.mcap", folder / f"drive{k:02d}.mcap")
-    for accuracy in (True, False):
-        (folder / "e.yaml").write_text(EXPERIMENT.replace("ACCURACY", str(accuracy).lower()))
-        yield {"accuracy": accuracy} | _compared(folder)
+    with common.scratch() as folder:
+        for k in range(NAMES):
+            shutil.copy(data / f"{DRIVES[k % len(DRIVES)]}.mcap", folder / f"drive{k:02d}.mcap")
+        for accuracy in (True, False):
+            (folder / "e.yaml").write_text(EXPERIMENT.replace("ACCURACY", str(accuracy).lower()))
+            yield {"accuracy": accuracy} | _compared(folder)
 
 
-def _compared(folder: Path) -> dict[str, object]:
+def _compared(folder: Path) -> common.Line:
     """Each way twice, the quicker one of it."""
     ways = ("one_thread", "two_threads", "local:2")
     found = {way: [] for way in ways}
@@ -50,9 +53,8 @@ def _compared(folder: Path) -> dict[str, object]:
         for way in ways:
             for name in ("kept", "warm"):
                 shutil.rmtree(folder / name, ignore_errors=True)
-            ended = subprocess.run(
-                [sys.executable, __file__, way, str(folder)], check=True, capture_output=True, text=True
-            )
+            command = [sys.executable, "-c", _ONE_WAY, str(common.ROOT / "tools"), way, str(folder)]
+            ended = subprocess.run(command, check=True, capture_output=True, text=True)
             found[way].append([float(value) for value in ended.stdout.split()])
     one, two, local = (min(found[way]) for way in ways)
     return {
@@ -62,8 +64,11 @@ def _compared(folder: Path) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _one(way: str, folder: Path) -> None:
-    """Seconds of one way, of its start, megabytes of a worker at most, rows."""
+_ONE_WAY = "import sys; sys.path.insert(0, sys.argv[1]); from benches.crew import go; go(*sys.argv[2:])"
+
+
+def go(way: str, folder: str) -> None:
+    """Print seconds of one way, of its start, megabytes of a worker at most, rows: in a process of its own."""
     import copem_replay as cr
     from copem_replay.cli.api.run import replayed, with_crew
     from copem_replay.cli.api.study import prepared, study_of
@@ -91,7 +96,3 @@ def _one(way: str, folder: Path) -> None:
     took_s = time.perf_counter() - began_s
     workers.close()
     print(took_s, start_s, hands.peak_bytes / 1e6, len(result.detections), computed_s)
-
-
-if __name__ == "__main__":
-    _one(sys.argv[1], Path(sys.argv[2]))

@@ -1,15 +1,14 @@
-"""What `fuzz_read.py` does to recordings: every way in which a file can be wrong, drawn from a seed."""
+"""What `fuzz.py` does to recordings: every way in which a file can be wrong, drawn from a seed."""
 
 from __future__ import annotations
 
-import json
 import random
 import re
 import struct
 import zlib
 from collections.abc import Callable
 
-from fuzz_container import CHUNK, Channel, Message, Model, Raw, Sample, Schema, compressed, model_of, record
+from fuzzing.mcap_model import Channel, Message, Model, Raw, Sample, Schema, compressed, model_of, record
 
 _INTS = (0, 1, 2, 22, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
 _FLOATS = (float("nan"), float("inf"), float("-inf"), 1e308, -1e308, 1e-320, 0.0, -0.0, -1.0, 1e7, 1e30, 2.0**63)
@@ -404,6 +403,3 @@ def hostile(samples: list[Sample], seed: str) -> tuple[bytes, str]:
             data = change_bytes(data, dice)
             done.append(change_bytes.__name__)
     return data, " ".join(done)
-
-
-__all__ = ["CHUNK", "bomb", "hostile", "json"]

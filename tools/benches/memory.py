@@ -6,38 +6,38 @@ not counted.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from statistics import median
+from collections.abc import Iterator
 
 import numpy as np
 
+from benches import common
 from copem_replay.core.lasting import ListTimes, drifting, held
 from copem_replay.core.random import CounterRng, RandomKey, object_words
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import Recording
 from copem_replay.pipeline.run import run
 
 LISTS, OBJECTS, RUNS, STEP_NS = 600, 20, 50, 100_000_000
 """One unit at 10 Hz, a minute."""
 
 
-def memory(experiment: Experiment, recordings: list[Recording]) -> Iterator[dict[str, object]]:
+def memory() -> Iterator[common.Line]:
+    """Numbers that last, and the crossing with all memory on."""
     yield numbers()
+    experiment, recordings = common.loaded("crossing")
     plain = experiment.model_copy(update={"runs": 2, "show": None})
     lasting = remembering(plain)
-    took = interleaved([lambda: run(plain, recordings), lambda: run(lasting, recordings)])
+    took = common.interleaved([lambda: run(plain, recordings), lambda: run(lasting, recordings)])
     yield {"memory_crossing_ratio": round(took[1] / took[0], 3), "seconds": round(took[1], 3)}
 
 
-def numbers() -> dict[str, object]:
+def numbers() -> common.Line:
     stamps = 1_700_000_000_000_000_000 + np.arange(LISTS) * STEP_NS
     none = np.zeros(LISTS, dtype=np.int64)
     words = np.repeat(object_words([str(k) for k in range(OBJECTS)]), LISTS)
     random_key = RandomKey(("u",), np.tile(none, OBJECTS), words, np.tile(stamps, OBJECTS))
     lists = ListTimes(stamps, none, np.tile(np.arange(LISTS), OBJECTS))
     rng, runs = CounterRng(1, "bench"), np.arange(RUNS)
-    uniform, slow, quick, normal, drifts = interleaved([
+    uniform, slow, quick, normal, drifts = common.interleaved([
         lambda: rng.uniform("p", random_key, runs),
         lambda: held(rng, "p", random_key, runs, 1.0),
         lambda: held(rng, "p", random_key, runs, 0.5),
@@ -60,16 +60,3 @@ def remembering(experiment: Experiment) -> Experiment:
     lasts = {"detection": [{"share": 0.6, "correlation_s": 0.8}], **dict.fromkeys(("position", "speed"), errors)}
     data["pems"] = {name: {"couples": couples, "memory": lasts} for name, couples in data["pems"].items()}
     return Experiment.model_validate(data)
-
-
-def interleaved(calls: list[Callable[[], object]], times: int = 9) -> list[float]:
-    """Median processor seconds of each call, in turn, after one that compiles and warms up."""
-    for call in calls:
-        call()
-    took: list[list[float]] = [[] for _ in calls]
-    for _ in range(times):
-        for seconds, call in zip(took, calls, strict=True):
-            start = time.process_time()
-            call()
-            seconds.append(time.process_time() - start)
-    return [median(seconds) for seconds in took]

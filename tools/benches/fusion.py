@@ -1,4 +1,4 @@
-"""Benchmarks of fusion, called by bench.py, which says how to take a time. Each gives one line or more.
+"""Benchmarks of fusion, by time and by how good it is.
 
 Objects and units but those of the crossing: objects on straight ways, one to 100 m², twenty units that capture at one
 instant, ten times a second, and list each object with probability .8, its position ± 1 m per axis, nothing else of
@@ -8,16 +8,15 @@ use (one class, no velocity), and no clutter.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
 from operator import call
-from pathlib import Path
 
 import numba as nb
 import numpy as np
 
+from benches import common
 from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.object_list import COVARIANCES, Inputs, ObjectLists, entries_of
 from copem_replay.core.tracks import CLASSES, Float, Tracks
@@ -32,14 +31,7 @@ from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.pipeline.blocks import blocks
 from copem_replay.pipeline.prepare import prepare
 from copem_replay.pipeline.receiver import WorldChunk, _without_truth, listen, seen_by_all
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from tests.oracles import gnn as gnn_oracle
-
-Best = Callable[[Callable[[], object], int], float]
-"""Seconds of the fastest of several calls."""
-Line = dict[str, object]
 
 PERIOD_S = 0.1
 GATE = 0.999
@@ -80,7 +72,7 @@ def scene(objects: int, units: int, count: int, seed: int = 0, common: float = 0
 # -------------------------------------------------------------------------------------------------------- the crossing
 
 
-def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterator[Line]:
+def crossing(experiment: Experiment, recording: Recording) -> Iterator[common.Line]:
     """Fused lists per second in one thread and in two: two blocks of runs, cut as `run` cuts them.
 
     Only the fusion: what units list, and when it arrives, is there before.
@@ -95,8 +87,8 @@ def crossing(best: Best, experiment: Experiment, recording: Recording) -> Iterat
             parts = [_fusing(world, name, *each) for each in zip(seen, told, strict=True)]
             work = [fused for fused, _ in parts]
             count = parts[0][1] * sum(map(len, cut))
-            one = best(lambda work=work: list(map(call, work)), 2) / count
-            two = best(lambda work=work: list(pool.map(call, work)), 2) / count
+            one = common.best(lambda work=work: list(map(call, work)), 2) / count
+            two = common.best(lambda work=work: list(pool.map(call, work)), 2) / count
             yield {
                 "fusion_lists_per_s": round(1 / one),
                 "algorithm": name,
@@ -120,7 +112,7 @@ def _fusing(world: WorldChunk, name: str, seen: Tracks, told: ObjectLists) -> tu
 # -------------------------------------------------------------------------------------------------- nearest neighbours
 
 
-def gnn_vs_numpy(best: Best, sizes: tuple[int, ...] = (15, 160)) -> Iterator[Line]:
+def gnn_vs_numpy(sizes: tuple[int, ...] = (15, 160)) -> Iterator[common.Line]:
     """Against the same algorithm in NumPy and SciPy, whose lists it has to give."""
     ours = Gnn(gate=GATE)
     for objects in sizes:
@@ -129,8 +121,8 @@ def gnn_vs_numpy(best: Best, sizes: tuple[int, ...] = (15, 160)) -> Iterator[Lin
         assert found.start.tolist() == expected.start.tolist(), "lists of other lengths"
         off_m = max(float(np.abs(found.entries[c] - expected.entries[c]).max()) for c in ("x_m", "y_m"))
         assert off_m < 1e-9, f"{off_m} m apart"
-        seconds = best(lambda told=told: ours.fuse(told), 20)
-        ratio = best(lambda told=told: gnn_oracle.fuse(told, gate=GATE), 3) / seconds
+        seconds = common.best(lambda told=told: ours.fuse(told), 20)
+        ratio = common.best(lambda told=told: gnn_oracle.fuse(told, gate=GATE), 3) / seconds
         yield {
             "gnn_vs_numpy": round(ratio, 1),
             "objects": objects,
@@ -140,13 +132,13 @@ def gnn_vs_numpy(best: Best, sizes: tuple[int, ...] = (15, 160)) -> Iterator[Lin
         }
 
 
-def gnn_growth(best: Best) -> Iterator[Line]:
+def gnn_growth() -> Iterator[common.Line]:
     """How the time of a fused list grows with objects, at one density, and with units."""
     ours = Gnn(gate=GATE)
     took: dict[tuple[int, int], float] = {}
     for objects, units in ((10, 20), (40, 5), (40, 10), (40, 20), (160, 20)):
         told, _ = scene(objects, units, max(2000 // objects, 10))
-        took[objects, units] = best(lambda told=told: ours.fuse(told), 10) / len(told.issue_s) * 1e6
+        took[objects, units] = common.best(lambda told=told: ours.fuse(told), 10) / len(told.issue_s) * 1e6
         yield {"gnn_us_per_list": round(took[objects, units], 1), "objects": objects, "units": units}
     yield {"gnn_growth": round(took[160, 20] / took[10, 20], 1), "bound_objects_squared": 256}
     # The first list of an instant meets nobody: 19 to be assigned, and 4.
@@ -167,7 +159,7 @@ COMBINED: tuple[tuple[str, ListFusion], ...] = (
 )
 
 
-def combining(best: Best, objects: int = 15, units: int = 6, count: int = 100) -> Iterator[Line]:
+def combining(objects: int = 15, units: int = 6, count: int = 100) -> Iterator[common.Line]:
     """Each way to combine, by time, and how true it is where half of every variance is common to all units.
 
     RMSE and NEES (2: honest) over the entries within 5 m of an object, all instants, of the one next to each.
@@ -175,7 +167,7 @@ def combining(best: Best, objects: int = 15, units: int = 6, count: int = 100) -
     told, truth = scene(objects, units, count, common=0.5)
     for name, fusion in COMBINED:
         found = fusion.fuse(told)
-        seconds = best(lambda fusion=fusion: fusion.fuse(told), 5)
+        seconds = common.best(lambda fusion=fusion: fusion.fuse(told), 5)
         error, cov = _next_to(truth, found)
         nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean()
         yield {
@@ -207,7 +199,7 @@ def _next_to(truth: Float, found: ObjectLists) -> tuple[Float, Float]:
 # -------------------------------------------------------------------------------------------------------------- a peer
 
 
-def gospa_vs_stonesoup(best: Best, pairs: int = 200) -> Iterator[Line]:
+def gospa_vs_stonesoup(pairs: int = 200) -> Iterator[common.Line]:
     """GOSPA of 15 × 15 points, c = 5 m, p = 2, against Stone Soup's, states built before."""
     try:
         from stonesoup.metricgenerator.ospametric import GOSPAMetric
@@ -230,9 +222,9 @@ def gospa_vs_stonesoup(best: Best, pairs: int = 200) -> Iterator[Line]:
     columns = [np.ascontiguousarray(points.transpose(2, 0, 1)) for points in (truth, output)]
     off = float(np.abs(_gospas(*columns, 5.0, 2.0) - theirs()).max())
     assert off < 1e-9, f"{off} m apart"
-    seconds = best(lambda: _gospas(*columns, 5.0, 2.0), 20)
+    seconds = common.best(lambda: _gospas(*columns, 5.0, 2.0), 20)
     yield {
-        "gospa_vs_stonesoup": round(best(theirs, 3) / seconds),
+        "gospa_vs_stonesoup": round(common.best(theirs, 3) / seconds),
         "gospa_per_s": round(pairs / seconds),
         "points": 15,
         "max_difference_m": off,
@@ -253,7 +245,7 @@ def _gospas(truth: Float, output: Float, cutoff_m: float, power: float) -> Float
     return value_m
 
 
-def tracker_vs_stonesoup(best: Best, scenes: int = 3, count: int = 6) -> Iterator[Line]:
+def tracker_vs_stonesoup(scenes: int = 3, count: int = 6) -> Iterator[common.Line]:
     """Tracks of 15 objects, lists of 20 units, against Stone Soup's two-dimensional assignment; and how good they are.
 
     Both have the same motion model, gate and knowledge of a new track's speed, hear list after list, and forget what
@@ -271,12 +263,12 @@ def tracker_vs_stonesoup(best: Best, scenes: int = 3, count: int = 6) -> Iterato
             yield {"tracker_vs_stonesoup": None} | MISSING
             return
         found: list[Float] = []
-        seconds = best(lambda told=told: ours.fuse(told), 20)
-        took.append((seconds, best(lambda feed=feed, found=found: found.append(feed()), 1)))
+        seconds = common.best(lambda told=told: ours.fuse(told), 20)
+        took.append((seconds, common.best(lambda feed=feed, found=found: found.append(feed()), 1)))
         last = ours.fuse(told).of(0, count - 1)
         said.append(_quality(truth[-1], np.stack([last["x_m"], last["y_m"]], axis=1)) + _quality(truth[-1], found[-1]))
     seconds, peer_seconds = np.mean(took, axis=0) / count
-    line: Line = {
+    line: common.Line = {
         "tracker_vs_stonesoup": round(peer_seconds / seconds),
         "us_per_instant": round(seconds * 1e6, 1),
         "stonesoup_us_per_instant": round(peer_seconds * 1e6),
@@ -337,3 +329,17 @@ def _quality(truth: Float, found: Float) -> tuple[float, ...]:
     """How many (m, 2) there are; RMS distance of each truth (n, 2) to the nearest, however many are left; GOSPA."""
     squared = ((truth[:, None] - found) ** 2).sum(axis=2).min(axis=1)
     return len(found), math.sqrt(squared.mean()), gospa(truth, found, cutoff_m=5.0, power=2.0).value_m
+
+
+def fusion() -> Iterator[common.Line]:
+    """Fused lists per second on the crossing, and how the time of one grows; see py."""
+    experiment, recordings = common.loaded("crossing")
+    yield from crossing(experiment, recordings[0])
+    yield from gnn_growth()
+    yield from combining()
+
+
+def peers() -> Iterator[common.Line]:
+    """Fusion and GOSPA against NumPy and SciPy, and against Stone Soup."""
+    for bench in (gnn_vs_numpy, gospa_vs_stonesoup, tracker_vs_stonesoup):
+        yield from bench()

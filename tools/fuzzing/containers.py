@@ -1,4 +1,4 @@
-"""Hostile inputs in every container that is read: MCAP files, OSI traces, folders of rosbag2. For `fuzz_read.py`."""
+"""Hostile inputs in every container that is read: MCAP files, OSI traces, folders of rosbag2. For `fuzz.py`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import shutil
 import struct
 from pathlib import Path
 
-from fuzz_container import Message, Model, Sample, model_of
-from fuzz_mutate import BYTES, MUTATORS, flipped, hostile, protobuf_hit
+from fuzzing.mcap_model import Message, Model, Sample, model_of
+from fuzzing.mutators import BYTES, MUTATORS, flipped, hostile, protobuf_hit
 
-_TRACES, _FOLDERS = 0.1, 0.1  # shares of the inputs
+TARGETS = ("mcap", "trace", "folder")
+_TRACES, _FOLDERS = 0.1, 0.1  # shares of the inputs where no target is asked for
 _KINDS = {b"osi3.GroundTruth": "gt", b"osi3.SensorView": "sv", b"osi3.SensorData": "sd"}
 _LENGTHS = (0, 1, 3, 255, 65_535, 10**6, 2**28, 2**28 + 1, 2**31 - 1, 2**31, 2**32 - 1)
 _NAMES = (
@@ -28,16 +29,18 @@ _DESCRIPTIONS = (
 Dice = random.Random
 
 
-def put(samples: list[Sample], seed: str, folder: Path) -> tuple[Path, str]:
-    """The input of a seed, written below `folder`: where it is, and what was done to it."""
+def put(samples: list[Sample], seed: str, folder: Path, target: str | None = None) -> tuple[Path, str]:
+    """The input of a seed, written below `folder`: where it is, and what was done to it. `target`: None: any."""
     dice = Dice(f"{seed} container")
     pick = dice.random()
-    if pick < _TRACES:
+    if target is None:
+        target = "trace" if pick < _TRACES else "folder" if pick < _TRACES + _FOLDERS else "mcap"
+    if target == "trace":
         name, data, done = trace(samples, dice)
         path = folder / name
         path.write_bytes(data)
         return path, done
-    if pick < _TRACES + _FOLDERS:
+    if target == "folder":
         return bag(samples, dice, folder / "input")
     data, done = hostile(samples, seed)
     path = folder / "input.mcap"

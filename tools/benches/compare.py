@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from benches import common
 from copem_replay.results.contents import write_parquet
 from copem_replay.results.tables import file_of
 
@@ -25,13 +25,13 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, time.perf_count
 """
 
 
-def studies() -> Iterator[dict[str, object]]:
+def compare() -> Iterator[common.Line]:
     """3 and 30 logs of 30,000 rows each, in a file for each log."""
     peaks: list[float] = []
     for logs in (3, 30):
-        with tempfile.TemporaryDirectory() as scratch:
-            write(Path(scratch), [f"log {k}" for k in range(logs)])
-            command = [sys.executable, "-c", _COMPARE, scratch]
+        with common.scratch() as folder:
+            write(folder, [f"log {k}" for k in range(logs)])
+            command = [sys.executable, "-c", _COMPARE, str(folder)]
             peak_mb, seconds = map(float, subprocess.run(command, check=True, capture_output=True).stdout.split())
         rows, peaks = logs * RUNS * OBJECTS * len(CONFIGURATIONS), [*peaks, peak_mb]
         yield {"compare_rows": rows, "peak_mb": round(peak_mb), "seconds": round(seconds, 1)}

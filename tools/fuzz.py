@@ -1,11 +1,13 @@
 """Read hostile files: recordings that were hit in every way, and what becomes of them.
 
-    python tools/fuzz_read.py --inputs 20000 --seed 1 --minutes 30
+    python tools/fuzz.py --inputs 20000 --seed 1 --minutes 30
+    python tools/fuzz.py folder
 
-Every input is a file, or a folder of rosbag2, made from a seed. It is surveyed and read, then its other lists are read
-and its messages copied, in a process whose memory is watched and that is ended when either takes more than 10 s of
-computing. Good ends: it was read (and what was skipped is said), or it is refused in single lines. Printed are lines of
-JSON: each defect with its seed and where the input is that shows it, at the end the counts.
+Targets are `mcap`, `trace` (OSI) and `folder` (rosbag2); with none, eight of ten inputs are MCAP. Every input is made
+from a seed. It is surveyed and read, then its other lists are read and its messages copied, in a process whose memory
+is watched and that is ended when either takes more than 10 s of computing. Good ends: it was read (and what was skipped
+is said), or it is refused in single lines. Printed are lines of JSON: each defect with its seed and where the input is
+that shows it, at the end the counts.
 """
 
 from __future__ import annotations
@@ -25,6 +27,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from fuzzing.containers import TARGETS, put
+from fuzzing.mcap_model import Model, Piece
+from fuzzing.samples import samples
 
 LONGEST_S = 10.0
 MOST_BYTES = 1_000_000_000
@@ -101,16 +107,11 @@ def _peak_bytes() -> int:
     return 0
 
 
-def _serve(pipe: Any, folder: str, most: int, own: bool) -> None:
+def _serve(pipe: Any, folder: str, most: int, own: bool, target: str | None) -> None:
     """Make and read the inputs that are asked for, until there are no more."""
-    from fuzz_containers import put
-    from fuzz_samples import samples
-
     all_samples = samples(most, own=own)
     warm = Path(folder) / "warm.mcap"
     for sample in all_samples:  # compiles
-        from fuzz_container import Model, Piece
-
         warm.write_bytes(Model([Piece([*sample.schemas, *sample.channels, *sample.messages])]).written())
         outcome(warm)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -118,7 +119,7 @@ def _serve(pipe: Any, folder: str, most: int, own: bool) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (room, room))
     pipe.send("ready")
     while (seed := pipe.recv()) is not None:
-        path, done = put(all_samples, seed, Path(folder))
+        path, done = put(all_samples, seed, Path(folder), target)
         pipe.send({"seed": seed, "done": done, "file": str(path)})
         Path("/proc/self/clear_refs").write_text("5")
         begin = time.process_time()
@@ -130,8 +131,8 @@ def _serve(pipe: Any, folder: str, most: int, own: bool) -> None:
 class _Worker:
     """A process that reads; started again when it had to be ended."""
 
-    def __init__(self, folder: Path, most: int, own: bool) -> None:
-        self._arguments = (str(folder), most, own)
+    def __init__(self, folder: Path, most: int, own: bool, target: str | None) -> None:
+        self._arguments = (str(folder), most, own, target)
         self._start()
 
     def _start(self) -> None:
@@ -182,14 +183,21 @@ def seeds(first: int, number: int) -> Iterator[str]:
 
 
 def fuzz(
-    inputs: int, seed: int, *, minutes: float = 1e9, most: int = 60, own: bool = False, keep: Path | None = None
+    inputs: int,
+    seed: int,
+    *,
+    minutes: float = 1e9,
+    most: int = 60,
+    own: bool = False,
+    keep: Path | None = None,
+    target: str | None = None,
 ) -> dict[str, Any]:
     """Read `inputs` files. The counts, the worst, and the defects; `keep`: where files that show one are put."""
     counts, worst_s, worst_bytes = Counter[str](), (0.0, ""), (0, "")
     defects: list[dict[str, Any]] = []
     until = time.monotonic() + 60 * minutes
     with tempfile.TemporaryDirectory() as folder:
-        worker = _Worker(Path(folder), most, own)
+        worker = _Worker(Path(folder), most, own, target)
         for name in seeds(seed, inputs):
             if time.monotonic() > until:
                 break
@@ -230,12 +238,13 @@ def _kept(made: Path, place: Path) -> Path:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("target", nargs="?", choices=TARGETS)
     parser.add_argument("--inputs", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--keep", type=Path, default=Path("out/fuzz"), help="where files that show a defect are put")
     asked = parser.parse_args()
-    found = fuzz(asked.inputs, asked.seed, minutes=asked.minutes, keep=asked.keep)
+    found = fuzz(asked.inputs, asked.seed, minutes=asked.minutes, keep=asked.keep, target=asked.target)
     kinds = Counter(d["what"].split(": ")[0] for d in found["defects"])
     print(json.dumps({**found, "defects": dict(kinds.most_common())}))
     return 1 if kinds else 0

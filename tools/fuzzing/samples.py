@@ -1,4 +1,4 @@
-"""The recordings that `fuzz_read.py` hits: those of the project, those beside it, and small ones of other kinds."""
+"""The recordings that `fuzz.py` hits: those of the project, those beside it, and small ones of other kinds."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from fuzz_container import Channel, Message, Sample, Schema, taken_apart
+from fuzzing.mcap_model import Channel, Message, Sample, Schema, taken_apart
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (ROOT / "logs", ROOT.parent / "shared" / "data")
 
 

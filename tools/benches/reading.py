@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from mcap.writer import Writer
 
+from benches import common
 from copem_replay.io.recording import read
 
 FRAMES, COUNT, STEP_S = 1200, 60, 0.05
@@ -49,20 +51,20 @@ DEFINITION = "\n".join(
 )
 
 
-def benches(folder: Path, osi: Path, best: Callable[..., float]) -> Iterator[dict[str, object]]:
+def by_format(folder: Path, osi: Path) -> Iterator[common.Line]:
     """Objects per second of each format (`osi`: the same as ground truth), and ROS 2 against mcap-ros2-support."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    yield _line("osi", best(lambda: read(osi, name="osi"), 3))
+    yield _line("osi", common.best(lambda: read(osi, name="osi"), 3))
     for name, (encoding, schema, payloads) in {
         "scene_update_protobuf": ("protobuf", *_scene_updates(as_json=False)),
         "scene_update_json": ("json", *_scene_updates(as_json=True)),
     }.items():
         path = _written(folder / f"{name}.mcap", "foxglove.SceneUpdate", encoding, schema, payloads)
-        yield _line(name, best(lambda path=path: read(path, name="scene"), 3))
+        yield _line(name, common.best(lambda path=path: read(path, name="scene"), 3))
     path = _written(folder / "tracked.mcap", _TRACKED, "cdr", ("ros2msg", DEFINITION.encode()), _tracked())
-    ours = best(lambda: read(path, name="tracked"), 3)
+    ours = common.best(lambda: read(path, name="tracked"), 3)
 
     def theirs() -> float:
         """Every message decoded, and the places of its objects touched."""
@@ -70,10 +72,10 @@ def benches(folder: Path, osi: Path, best: Callable[..., float]) -> Iterator[dic
             messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
             return sum(o.kinematics.pose_with_covariance.pose.position.x for *_, m in messages for o in m.objects)
 
-    yield _line("tracked_objects", ours) | {"times_mcap_ros2_support": round(best(theirs, 1) / ours, 1)}
+    yield _line("tracked_objects", ours) | {"times_mcap_ros2_support": round(common.best(theirs, 1) / ours, 1)}
 
 
-def _line(name: str, seconds: float) -> dict[str, object]:
+def _line(name: str, seconds: float) -> common.Line:
     return {"read_objects_per_s": round(STATES / seconds), "format": name}
 
 
@@ -192,3 +194,35 @@ def _scene_updates(*, as_json: bool) -> tuple[tuple[str, bytes], list[bytes]]:
     if as_json:
         return ("jsonschema", b"{}"), messages
     return ("protobuf", build_file_descriptor_set(SceneUpdate).SerializeToString()), messages
+
+
+def reading() -> Iterator[common.Line]:
+    """Reading 60 s × 20 Hz × 60 objects, against parsing the messages and touching the same fields in a plain loop."""
+    with common.scratch() as folder:
+        path = folder / "read.mcap"
+        common.write_truth(path, common.boxes(1200, 60))
+        ours = common.best(lambda: read(path, name="read"), 3)
+        plain = common.best(lambda: plain_loop(path), 3)
+        yield {"read_ratio": round(ours / plain, 3), "read_objects_per_s": round(72_000 / ours)}
+        yield from by_format(folder, path)
+
+
+def plain_loop(path: Path) -> int:
+    """What a script would do: parse every message, touch every field that `read` needs, keep the numbers."""
+    from mcap.reader import make_reader
+    from osi3.osi_groundtruth_pb2 import GroundTruth
+
+    rows = []
+    with path.open("rb") as file:
+        for _schema, _channel, message in make_reader(file).iter_messages():
+            truth = GroundTruth.FromString(message.data)
+            t = truth.timestamp.seconds * 10**9 + truth.timestamp.nanos
+            for item in truth.moving_object:
+                base = item.base
+                rows.append(
+                    (t, item.id.value, item.type, item.vehicle_classification.type,
+                     base.position.x, base.position.y, base.position.z, base.orientation.yaw,
+                     base.velocity.x, base.velocity.y,
+                     base.dimension.length, base.dimension.width, base.dimension.height)
+                )  # fmt: skip
+    return len(pd.DataFrame(rows))

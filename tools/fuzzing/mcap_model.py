@@ -1,4 +1,4 @@
-"""MCAP files taken apart to be hit and put together again, with checksums that fit: for `fuzz_read.py`."""
+"""MCAP files taken apart to be hit and put together again, with checksums that fit: for `fuzz.py`."""
 
 from __future__ import annotations
 

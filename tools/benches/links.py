@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
-from bench_memory import interleaved
+from benches import common
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import Recording, read
 from copem_replay.pipeline.prepare import Replay, prepare
 from copem_replay.pipeline.run import run
 
@@ -30,7 +30,8 @@ LINKS: dict[str, dict[str, Any]] = {
 KINDS = (("ideal", False), ("ideal", True), ("gnn", False), ("gnn", True), ("tracker", False), ("tracker", True))
 
 
-def links(recording: Recording) -> Iterator[dict[str, object]]:
+def by_fusion(recording: Recording) -> Iterator[common.Line]:
+    """A line for each fusion, with accuracy and without."""
     for fusion, accuracy in KINDS:
         plans = [plan(link, fusion, accuracy) for link in LINKS.values()]
         ready = [prepare(recording, one) for one in plans]
@@ -39,7 +40,9 @@ def links(recording: Recording) -> Iterator[dict[str, object]]:
             vars(replay).pop("_drawn", None)  # what links drew is of the call before
             run(experiment, [recording], ready=[replay])
 
-        constant_s, drawn_s = interleaved([partial(replayed, one, its) for one, its in zip(plans, ready, strict=True)])
+        constant_s, drawn_s = common.interleaved(
+            [partial(replayed, one, its) for one, its in zip(plans, ready, strict=True)]
+        )
         yield {
             "links": fusion + (" with accuracy" if accuracy else ""),
             "constant_ms_a_run": round(constant_s / RUNS * 1e3, 2),
@@ -59,3 +62,10 @@ def plan(link: dict[str, Any], fusion: str, accuracy: bool) -> Experiment:
         "configurations": {"coop": {"units": "all", "link": "v2x", "issue_hz": 10, "fusion": {"kind": fusion}}},
         "measure": {"accuracy": accuracy},
     })  # fmt: skip
+
+
+def links() -> Iterator[common.Line]:
+    """A minute of 20 objects, five of which send what they see by radio: what it costs that arrivals are drawn."""
+    with common.scratch() as folder:
+        common.write_truth(folder / "minute.mcap", common.boxes(600, 20))
+        yield from by_fusion(read(folder / "minute.mcap", name="minute", ego="0"))

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 
 import numpy as np
 
+from benches import common
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.fit.detection import fit_detection
@@ -34,18 +34,17 @@ PEM = {
 }  # fmt: skip
 
 
-def detection() -> Iterator[dict[str, object]]:
+def fit() -> Iterator[common.Line]:
+    """The full ladder, and the check of a fit by replays."""
     rows, lists = drives()
     fit_detection(rows, lists)
-    start, busy = time.perf_counter(), time.process_time()
-    fit = fit_detection(rows, lists)
-    took = {"fit_detection_s": round(time.perf_counter() - start, 2), "cpu_s": round(time.process_time() - busy, 2)}
-    share = fit.memory["share"].value if fit.memory else None
-    yield {**took, "rows": len(rows.listed), "rungs": len(fit.ladder), "share": share}
+    found, seconds, cpu_s = common.timed(lambda: fit_detection(rows, lists))
+    took = {"fit_detection_s": round(seconds, 2), "cpu_s": round(cpu_s, 2)}
+    share = found.memory["share"].value if found.memory else None
+    yield {**took, "rows": len(rows.listed), "rungs": len(found.ladder), "share": share}
     some = rows.take(rows.pass_ix < 100)
-    start = time.perf_counter()
-    replayed(Pem.model_validate(PEM), some, lists, runs=500)
-    yield {"fit_replay_check_s": round(time.perf_counter() - start, 2), "rows": len(some.listed), "runs": 500}
+    checked = common.timed(lambda: replayed(Pem.model_validate(PEM), some, lists, runs=500))
+    yield {"fit_replay_check_s": round(checked.seconds, 2), "rows": len(some.listed), "runs": 500}
 
 
 def drives() -> tuple[FitRows, FitLists]:

@@ -1,0 +1,1 @@
+"""Benchmarks: a section per file, each a generator of lines; `tools/bench.py` runs them."""

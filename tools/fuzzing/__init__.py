@@ -1,0 +1,1 @@
+"""What `tools/fuzz.py` reads: recordings taken apart, hit, and put together again in every container."""
